@@ -1,0 +1,21 @@
+//! Pure core of the hand teleoperation service.
+//!
+//! Nothing here touches a socket, a file, a clock or a thread: time and bytes are arguments, so the same code runs
+//! in the live processes and in tests with virtual time. The two shells that do touch the outside are opt-in:
+//! `net` (zenoh) and `viz` (Rerun).
+//!
+//! | module | one line |
+//! |---|---|
+//! | [`hand`] | the robot hand: URDF + description to a flat [`hand::HandModel`], forward kinematics, Jacobians |
+//! | [`master`] | the human hand: the paradigmatic 20-joint model, keypoint fit, calibration, gestures |
+//! | [`mapping`] | the combined joint-Cartesian mapping, Eq. 1-14 |
+//! | [`ik`] | bounded lexicographic inverse kinematics of one finger |
+//! | [`time`] | monotonic time as a number |
+//! | [`testing`] | where tests find recordings |
+
+pub mod hand;
+pub mod ik;
+pub mod mapping;
+pub mod master;
+pub mod testing;
+pub mod time;

@@ -1,0 +1,1 @@
+//! The `operator` process as a library.

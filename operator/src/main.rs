@@ -1,0 +1,2 @@
+//! Entry point of the `operator` process.
+fn main() {}

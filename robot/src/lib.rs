@@ -1,0 +1,1 @@
+//! The `robot` process as a library.

@@ -1,0 +1,2 @@
+//! Entry point of the `robot` process.
+fn main() {}
