@@ -105,6 +105,16 @@ impl FingerChain {
     /// Position of the tip in the palm frame (m) and its linear Jacobian.
     #[must_use]
     pub fn tip_and_jacobian(&self, q: &[f64], frame: TipFrame) -> (Vector3<f64>, TipJacobian) {
+        let (tip, jacobian, _) = self.differential(q, frame);
+        (tip, jacobian)
+    }
+
+    /// Tip, Jacobian and the joint axes (unit vectors), all in the palm frame.
+    pub(crate) fn differential(
+        &self,
+        q: &[f64],
+        frame: TipFrame,
+    ) -> (Vector3<f64>, TipJacobian, [Vector3<f64>; MAX_FINGER_JOINTS]) {
         let mut position = Vector3::zeros();
         let mut rotation = Matrix3::identity();
         let mut origins = [Vector3::zeros(); MAX_FINGER_JOINTS];
@@ -121,7 +131,7 @@ impl FingerChain {
         for slot in 0..self.joints.len() {
             jacobian.set_column(slot, &axes[slot].cross(&(tip - origins[slot])));
         }
-        (tip, jacobian)
+        (tip, jacobian, axes)
     }
 
     /// The finger's own joint angles out of the whole hand's `q`, palm outwards.

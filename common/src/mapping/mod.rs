@@ -1,6 +1,28 @@
 //! The combined joint-Cartesian mapping of Meattini, Chiaravalli, Palli and Melchiorri (IFAC 2020), Eq. 1-14.
+//!
+//! Far from the thumb a finger copies the master's joint angles (Eq. 7); near the thumb its tip follows the master's
+//! tip relative to the thumb's (Eq. 9-12); in between the two targets are blended (Eq. 13) by a gain that falls from
+//! 1 to 0 between two spheres of radius r1 and r2 around the master's thumb tip (Eq. 14). The printed equations have
+//! errors; where this differs, the item says so.
+//!
+//! | module | one line |
+//! |---|---|
+//! | [`params`](MappingParams) | every parameter, the two presets, validation |
+//! | [`gain`](Gain) | Eq. 14 |
+//! | [`cartesian`](CartesianMap) | Eq. 9-12 |
+//! | [`retargeter`](Retargeter) | the whole step: a [`crate::master::MasterPose`] in, a [`MappingOutput`] out |
+
+mod cartesian;
+mod gain;
+mod params;
+mod retargeter;
 
 use nalgebra::Vector3;
+
+pub use cartesian::CartesianMap;
+pub use gain::Gain;
+pub use params::{Anchor, GainShape, MappingMode, MappingParams, ParamError, ThumbGain};
+pub use retargeter::Retargeter;
 
 use crate::hand::{Finger, JointVector, MAX_FINGERS};
 use crate::ik::IkReport;
@@ -30,6 +52,26 @@ pub struct FingerSignals {
     pub ik: IkReport,
 }
 
+impl FingerSignals {
+    /// All zero.
+    #[must_use]
+    pub fn zero(finger: Finger) -> Self {
+        let origin = Vector3::zeros();
+        Self {
+            finger,
+            delta: 0.0,
+            k: 0.0,
+            p_joint: origin,
+            p_cartesian: origin,
+            p_input: origin,
+            p: origin,
+            e_q: 0.0,
+            e_c: 0.0,
+            ik: IkReport::default(),
+        }
+    }
+}
+
 /// What the mapping makes of one master pose.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct MappingOutput {
@@ -42,9 +84,24 @@ pub struct MappingOutput {
 }
 
 impl MappingOutput {
+    /// An output with the given signals, thumb first; signals beyond [`MAX_FINGERS`] are left out.
+    #[must_use]
+    pub fn new(q_joint: JointVector, q: JointVector, signals: &[FingerSignals]) -> Self {
+        let len = signals.len().min(MAX_FINGERS);
+        let mut all = Finger::ALL.map(FingerSignals::zero);
+        all[..len].copy_from_slice(&signals[..len]);
+        Self { q_joint, q, signals: all, len }
+    }
+
     /// Signals of the slave's fingers, thumb first.
     #[must_use]
     pub fn fingers(&self) -> &[FingerSignals] {
         &self.signals[..self.len]
+    }
+
+    /// Signals of one finger, if the slave has it.
+    #[must_use]
+    pub fn finger(&self, finger: Finger) -> Option<&FingerSignals> {
+        self.fingers().iter().find(|signals| signals.finger == finger)
     }
 }

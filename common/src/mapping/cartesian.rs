@@ -1,0 +1,75 @@
+use nalgebra::Vector3;
+
+use crate::hand::{Finger, HandModel, MAX_FINGERS};
+use crate::master::MasterGeometry;
+
+/// The Cartesian mapping of the thumb (Eq. 10-12) and of the fingers relative to it (Eq. 9).
+///
+/// Points are in O_W (master) and O_SW (slave), m. The finger base frames O_i and O_Si are translated copies of O_W
+/// and O_SW: with the Allegro's 5 degree toe-out in them, Eq. 10 would jump at the index and ring bases.
+#[derive(Clone, Debug)]
+pub struct CartesianMap {
+    scale: f64,
+    // (finger, o_Si), radial to ulnar, without the thumb.
+    bases: [(Finger, Vector3<f64>); MAX_FINGERS],
+    count: usize,
+}
+
+impl CartesianMap {
+    /// The mapping onto `hand` with scale c_s.
+    #[must_use]
+    pub fn new(hand: &HandModel, scale: f64) -> Self {
+        let mut bases = [(Finger::Index, Vector3::zeros()); MAX_FINGERS];
+        let fingers = hand.fingers.iter().filter(|chain| chain.finger != Finger::Thumb).take(MAX_FINGERS);
+        let mut count = 0;
+        for (slot, chain) in bases.iter_mut().zip(fingers) {
+            *slot = (chain.finger, chain.base);
+            count += 1;
+        }
+        Self { scale, bases, count }
+    }
+
+    /// p_C,T: target of the slave's thumb tip in O_SW for the master's in O_W (Eq. 10-12).
+    ///
+    /// The radial coordinate is scaled by c_s outside the span of the finger bases and interpolated between them
+    /// inside, which makes it continuous and monotone; the others are scaled about the first finger's base. Below
+    /// the last finger that the slave has, c_s takes over again (the Allegro has no little finger).
+    #[must_use]
+    pub fn thumb(&self, geometry: &MasterGeometry, tip: &Vector3<f64>) -> Vector3<f64> {
+        let bases = &self.bases[..self.count];
+        let Some(&(first, first_slave)) = bases.first() else {
+            return tip * self.scale;
+        };
+        let origin = Vector3::from(geometry.bases[first.index()]);
+        let mut target = first_slave + (tip - origin) * self.scale;
+        target.x = self.radial(geometry, tip.x);
+        target
+    }
+
+    /// x_S(x), Eq. 10.
+    fn radial(&self, geometry: &MasterGeometry, x: f64) -> f64 {
+        let base = |finger: Finger| geometry.bases[finger.index()][0];
+        let bases = &self.bases[..self.count];
+        let (Some(&(first, first_slave)), Some(&(last, last_slave))) = (bases.first(), bases.last()) else {
+            return x * self.scale;
+        };
+        if x >= base(first) {
+            return first_slave.x + self.scale * (x - base(first));
+        }
+        for pair in bases.windows(2) {
+            let ((from, from_slave), (to, to_slave)) = (pair[0], pair[1]);
+            if x >= base(to) {
+                // d_{l,t}: ratio of the spacings of the finger bases.
+                let ratio = (from_slave.x - to_slave.x) / (base(from) - base(to));
+                return from_slave.x + ratio * (x - base(from));
+            }
+        }
+        last_slave.x + self.scale * (x - base(last))
+    }
+
+    /// p_C,j: target of a slave fingertip in O_SW, hanging on the slave's thumb at `anchor` (Eq. 9).
+    #[must_use]
+    pub fn finger(&self, tip: &Vector3<f64>, thumb: &Vector3<f64>, anchor: &Vector3<f64>) -> Vector3<f64> {
+        anchor + (tip - thumb) * self.scale
+    }
+}
