@@ -1,0 +1,285 @@
+//! Configuration: a preset, then the file, then the command line.
+
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use serde::{Deserialize, Serialize};
+use teleop_common::hand::{HandError, HandModel, HandSide};
+use teleop_common::mapping::{MappingMode, MappingParams, ParamError};
+
+use crate::control::{ControlParams, GateParams};
+
+/// Everything that can be set in a configuration file, with its defaults.
+///
+/// ```toml
+/// preset = "default"        # or "paper"; [mapping] then changes single parameters of it
+/// [mapping]
+/// r2 = 0.06
+/// [control]
+/// rate_hz = 333.0
+/// ```
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+struct File {
+    preset: String,
+    mapping: toml::Table,
+    control: ControlFile,
+}
+
+impl Default for File {
+    fn default() -> Self {
+        Self { preset: "default".to_owned(), mapping: toml::Table::new(), control: ControlFile::default() }
+    }
+}
+
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+struct ControlFile {
+    rate_hz: f64,
+    hold_after_s: f64,
+    max_age_s: f64,
+    smoothing_s: f64,
+    engage_speed_rad_s: f64,
+    engage_ramp_s: f64,
+    velocity_scale: f64,
+    acceleration_scale: f64,
+}
+
+impl Default for ControlFile {
+    fn default() -> Self {
+        let params = ControlParams::default();
+        Self {
+            rate_hz: params.rate,
+            hold_after_s: params.hold_after.as_secs_f64(),
+            max_age_s: 0.25,
+            smoothing_s: params.smoothing,
+            engage_speed_rad_s: params.engage_speed,
+            engage_ramp_s: params.engage_ramp,
+            velocity_scale: 1.0,
+            acceleration_scale: 1.0,
+        }
+    }
+}
+
+/// What the command line may override.
+#[derive(Clone, Debug, Default)]
+pub struct Overrides {
+    /// Preset name.
+    pub preset: Option<String>,
+    /// Which mapping.
+    pub mode: Option<MappingMode>,
+    /// Control rate, Hz.
+    pub rate: Option<f64>,
+}
+
+/// Checked configuration of the control loop.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Config {
+    /// The mapping.
+    pub mapping: MappingParams,
+    /// The loop.
+    pub control: ControlParams,
+    /// Whose poses are obeyed.
+    pub gate: GateParams,
+    /// Factor on the velocity limits of the hand's description, (0, 1].
+    pub velocity_scale: f64,
+    /// Factor on its acceleration limits, (0, 10].
+    pub acceleration_scale: f64,
+}
+
+/// A configuration that cannot be used.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum ConfigError {
+    /// The file cannot be read.
+    #[error("cannot read {path}: {source}", path = path.display())]
+    Read {
+        /// The file.
+        path: PathBuf,
+        /// Why.
+        source: std::io::Error,
+    },
+    /// The file is not what is expected.
+    #[error("{path}: {message}", path = path.display())]
+    Syntax {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong, with its line.
+        message: String,
+    },
+    /// A mapping parameter is not usable.
+    #[error(transparent)]
+    Mapping(#[from] ParamError),
+    /// A control parameter is out of range.
+    #[error("control.{name} = {value} is not usable: it must be {rule}")]
+    Range {
+        /// Name in the file.
+        name: &'static str,
+        /// The value.
+        value: f64,
+        /// What is allowed.
+        rule: &'static str,
+    },
+    /// The hand's URDF or description cannot be used.
+    #[error("{origin}: {source}")]
+    Hand {
+        /// Where it came from.
+        origin: String,
+        /// What is wrong.
+        source: HandError,
+    },
+}
+
+impl Config {
+    /// Reads `path` (if any) over the preset, then applies `overrides`, then checks everything.
+    ///
+    /// # Errors
+    /// Names the file and the parameter.
+    pub fn load(path: Option<&Path>, overrides: &Overrides) -> Result<Self, ConfigError> {
+        let (text, origin) = match path {
+            Some(path) => {
+                let read = std::fs::read_to_string(path);
+                (read.map_err(|source| ConfigError::Read { path: path.to_owned(), source })?, path.to_owned())
+            }
+            None => (String::new(), PathBuf::from("defaults")),
+        };
+        Self::parse(&text, &origin, overrides)
+    }
+
+    fn parse(text: &str, origin: &Path, overrides: &Overrides) -> Result<Self, ConfigError> {
+        let syntax = |message: String| ConfigError::Syntax { path: origin.to_owned(), message };
+        let file: File = toml::from_str(text).map_err(|error| syntax(error.to_string()))?;
+        let preset = MappingParams::preset(overrides.preset.as_ref().unwrap_or(&file.preset))?;
+        let mut merged = toml::Table::try_from(&preset).map_err(|error| syntax(error.to_string()))?;
+        merged.extend(file.mapping);
+        let mut mapping: MappingParams =
+            merged.try_into().map_err(|error| syntax(format!("in [mapping]: {}", error.message())))?;
+        if let Some(mode) = overrides.mode {
+            mapping.mode = mode;
+        }
+        mapping.validate()?;
+        let mut control = file.control;
+        if let Some(rate) = overrides.rate {
+            control.rate_hz = rate;
+        }
+        control.check(mapping)
+    }
+}
+
+impl ControlFile {
+    fn check(&self, mapping: MappingParams) -> Result<Config, ConfigError> {
+        let range = |name, value: f64, from: f64, to: f64, rule| {
+            if (from..=to).contains(&value) { Ok(value) } else { Err(ConfigError::Range { name, value, rule }) }
+        };
+        let rate = range("rate_hz", self.rate_hz, 20.0, 2000.0, "from 20 to 2000 Hz")?;
+        let hold_after = range("hold_after_s", self.hold_after_s, 0.01, 2.0, "from 0.01 to 2 s")?;
+        let max_age = range("max_age_s", self.max_age_s, 0.01, 5.0, "from 0.01 to 5 s")?;
+        Ok(Config {
+            mapping,
+            control: ControlParams {
+                rate,
+                hold_after: Duration::from_secs_f64(hold_after),
+                smoothing: range("smoothing_s", self.smoothing_s, 0.0, 1.0, "from 0 (off) to 1 s")?,
+                engage_speed: range(
+                    "engage_speed_rad_s",
+                    self.engage_speed_rad_s,
+                    0.05,
+                    20.0,
+                    "from 0.05 to 20 rad/s",
+                )?,
+                engage_ramp: range("engage_ramp_s", self.engage_ramp_s, 0.0, 30.0, "from 0 to 30 s")?,
+            },
+            gate: GateParams {
+                max_age: Duration::from_secs_f64(max_age),
+                release_after: Duration::from_secs_f64(hold_after),
+            },
+            velocity_scale: range("velocity_scale", self.velocity_scale, 0.01, 1.0, "from 0.01 to 1")?,
+            acceleration_scale: range("acceleration_scale", self.acceleration_scale, 0.01, 10.0, "from 0.01 to 10")?,
+        })
+    }
+}
+
+/// Where the hand comes from.
+#[derive(Clone, Debug)]
+pub struct HandSource {
+    /// Which of the compiled-in hands.
+    pub side: HandSide,
+    /// A URDF instead of the compiled-in one.
+    pub urdf: Option<PathBuf>,
+    /// A description instead of the compiled-in one.
+    pub description: Option<PathBuf>,
+}
+
+impl HandSource {
+    /// Loads the hand and applies the configured limits.
+    ///
+    /// # Errors
+    /// Names the file and the element that is wrong.
+    pub fn load(&self, config: &Config) -> Result<HandModel, ConfigError> {
+        let read = |path: &PathBuf| {
+            std::fs::read_to_string(path).map_err(|source| ConfigError::Read { path: path.clone(), source })
+        };
+        let mut hand = if self.urdf.is_none() && self.description.is_none() {
+            HandModel::allegro_v4(self.side)
+        } else {
+            let (urdf, description) = HandModel::allegro_v4_texts(self.side);
+            let urdf_text = self.urdf.as_ref().map_or_else(|| Ok(urdf.to_owned()), read)?;
+            let text = self.description.as_ref().map_or_else(|| Ok(description.to_owned()), read)?;
+            HandModel::load(&urdf_text, &text).map_err(|source| ConfigError::Hand { origin: self.origin(), source })?
+        };
+        for joint in &mut hand.joints {
+            joint.velocity *= config.velocity_scale;
+            joint.acceleration *= config.acceleration_scale;
+        }
+        Ok(hand)
+    }
+
+    fn origin(&self) -> String {
+        let name = |path: &Option<PathBuf>, kind: &str| {
+            path.as_ref().map_or_else(|| format!("built-in {kind}"), |path| path.display().to_string())
+        };
+        format!("hand from {} and {}", name(&self.urdf, "URDF"), name(&self.description, "description"))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn parse(text: &str) -> Result<Config, ConfigError> {
+        Config::parse(text, Path::new("robot.toml"), &Overrides::default())
+    }
+
+    #[test]
+    fn a_file_changes_single_parameters_of_its_preset() {
+        let config = parse("preset = \"paper\"\n[mapping]\nr2 = 0.05\n[control]\nrate_hz = 500").unwrap();
+        assert_eq!(config.mapping, MappingParams { r2: 0.05, ..MappingParams::paper() });
+        assert_eq!(config.control.rate, 500.0);
+        assert_eq!(parse("").unwrap().mapping, MappingParams::default());
+    }
+
+    #[test]
+    fn the_command_line_wins() {
+        let overrides =
+            Overrides { preset: Some("paper".to_owned()), mode: Some(MappingMode::Joint), rate: Some(100.0) };
+        let config = Config::parse("preset = \"default\"", Path::new("x"), &overrides).unwrap();
+        assert_eq!(config.mapping, MappingParams { mode: MappingMode::Joint, ..MappingParams::paper() });
+        assert_eq!(config.control.rate, 100.0);
+    }
+
+    #[test]
+    fn errors_name_the_value_and_the_rule() {
+        for (text, expected) in [
+            ("preset = \"best\"", "preset \"best\" is unknown"),
+            ("[mapping]\nr1 = -1", "mapping.r1 = -1 is not usable"),
+            ("[mapping]\nr2 = 0.01", "mapping.r2 = 0.01 is not usable: it must be at least r1"),
+            ("[mapping]\nradius = 1", "radius"),
+            ("[control]\nrate_hz = 0", "control.rate_hz = 0 is not usable: it must be from 20 to 2000 Hz"),
+            ("[control]\nhold_after_s = nan", "control.hold_after_s = NaN"),
+            ("speed = 3", "speed"),
+        ] {
+            let message = parse(text).unwrap_err().to_string();
+            assert!(message.contains(expected), "{text}: {message}");
+        }
+    }
+}

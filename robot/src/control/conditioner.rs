@@ -1,0 +1,247 @@
+use teleop_common::hand::{HandModel, JointVector, MAX_JOINTS};
+
+/// Limits of one joint's command.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct JointLimits {
+    /// Lowest position, rad.
+    pub lower: f64,
+    /// Highest position, rad.
+    pub upper: f64,
+    /// Largest speed, rad/s.
+    pub velocity: f64,
+    /// Largest change of velocity, rad/s².
+    pub acceleration: f64,
+}
+
+/// Turns targets that may jump into commands that a hand can follow: low-pass, then limits of position, velocity and
+/// acceleration against the last command (the order of libfranka).
+///
+/// For any input sequence, NaN and infinities included, every command is inside the joint limits, differs from the
+/// one before by at most `velocity * period`, and its velocity by at most `acceleration * period`.
+#[derive(Clone, Debug)]
+pub struct Conditioner {
+    limits: [JointLimits; MAX_JOINTS],
+    period: f64,
+    // Share of the distance that each of the two cascaded first-order low-passes covers in a tick.
+    share: f64,
+    position: JointVector,
+    velocity: JointVector,
+    // The two stages of the low-pass.
+    stages: [JointVector; 2],
+}
+
+impl Conditioner {
+    /// A conditioner at rest at the hand's `start` posture (clipped), for ticks `period` seconds apart, with a
+    /// low-pass of time constant `smoothing` seconds per stage (0 is off).
+    #[must_use]
+    pub fn new(hand: &HandModel, start: &JointVector, period: f64, smoothing: f64) -> Self {
+        let unused = JointLimits { lower: 0.0, upper: 0.0, velocity: 0.0, acceleration: 0.0 };
+        let mut limits = [unused; MAX_JOINTS];
+        for (slot, joint) in limits.iter_mut().zip(&hand.joints) {
+            *slot = JointLimits {
+                lower: joint.lower,
+                upper: joint.upper,
+                velocity: joint.velocity,
+                acceleration: joint.acceleration,
+            };
+        }
+        let position = hand.clip(start);
+        Self {
+            limits,
+            period,
+            share: if smoothing > 0.0 { 1.0 - (-period / smoothing).exp() } else { 1.0 },
+            position,
+            velocity: JointVector::zeros(position.len()),
+            stages: [position; 2],
+        }
+    }
+
+    /// The last command, rad.
+    #[must_use]
+    pub fn position(&self) -> &JointVector {
+        &self.position
+    }
+
+    /// Velocity of the last command, rad/s.
+    #[must_use]
+    pub fn velocity(&self) -> &JointVector {
+        &self.velocity
+    }
+
+    /// Restarts the low-pass at the last command, so that a new target is approached from there.
+    pub fn reset_filter(&mut self) {
+        self.stages = [self.position; 2];
+    }
+
+    /// Next command towards `target` (rad), with speeds further limited to `speed` (rad/s).
+    ///
+    /// A target that is not finite is ignored: the joint holds.
+    pub fn follow(&mut self, target: &JointVector, speed: f64) {
+        for joint in 0..self.position.len() {
+            let limits = self.limits[joint];
+            let wanted = target.get(joint).copied().filter(|value| value.is_finite());
+            let wanted = wanted.unwrap_or(self.position[joint]).clamp(limits.lower, limits.upper);
+            let before = self.stages[1][joint];
+            self.stages[0][joint] += (wanted - self.stages[0][joint]) * self.share;
+            self.stages[1][joint] += (self.stages[0][joint] - before) * self.share;
+            let moved = (self.stages[1][joint] - before) / self.period;
+            // Follow the filtered target's own motion, and close the gap to it as fast as can still be braked.
+            let gap = before - self.position[joint];
+            let closing = brakeable(gap.abs(), limits.acceleration, self.period).copysign(gap);
+            self.advance(joint, moved + closing, speed);
+        }
+    }
+
+    /// Next command of a stop: brakes as fast as allowed, then stands still.
+    pub fn hold(&mut self) {
+        for joint in 0..self.position.len() {
+            self.advance(joint, 0.0, f64::INFINITY);
+        }
+        self.reset_filter();
+    }
+
+    /// True once a hold has come to rest.
+    #[must_use]
+    pub fn at_rest(&self) -> bool {
+        self.velocity.iter().all(|velocity| *velocity == 0.0)
+    }
+
+    fn advance(&mut self, joint: usize, wanted: f64, speed: f64) {
+        let limits = self.limits[joint];
+        let (position, velocity) = (self.position[joint], self.velocity[joint]);
+        let change = limits.acceleration * self.period;
+        // A lower speed limit is reached by braking, never by a jump.
+        let speed = speed.max(velocity.abs() - change).min(limits.velocity);
+        let to_lower = -brakeable(position - limits.lower, limits.acceleration, self.period);
+        let to_upper = brakeable(limits.upper - position, limits.acceleration, self.period);
+        let next = wanted
+            .clamp(-speed, speed)
+            .clamp(velocity - change, velocity + change)
+            // Last, because it is never in conflict with the acceleration: every earlier step kept the way to brake.
+            .max(to_lower)
+            .min(to_upper);
+        self.velocity[joint] = next;
+        self.position[joint] = (position + next * self.period).clamp(limits.lower, limits.upper);
+    }
+}
+
+/// Largest velocity for one tick from which a joint can still stop within `distance` (m or rad), braking by
+/// `acceleration` once a tick.
+///
+/// From velocity `n a dt` the joint travels `a dt^2 (1 + 2 + .. + n)` including this tick; in between the distance is
+/// linear in the velocity. Being exact in discrete time, it neither overshoots nor creeps.
+fn brakeable(distance: f64, acceleration: f64, period: f64) -> f64 {
+    let unit = acceleration * period * period;
+    if distance.is_nan() || distance <= 0.0 || unit <= 0.0 {
+        return 0.0;
+    }
+    let steps = (0.5 * ((1.0 + 8.0 * distance / unit).sqrt() - 1.0)).floor();
+    let covered = 0.5 * unit * steps * (steps + 1.0);
+    steps * acceleration * period + (distance - covered) / ((steps + 1.0) * period)
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+    use teleop_common::hand::HandSide;
+
+    use super::*;
+
+    const PERIOD: f64 = 0.003;
+
+    fn hand() -> HandModel {
+        HandModel::allegro_v4(HandSide::Right)
+    }
+
+    fn adversarial() -> impl Strategy<Value = f64> {
+        prop_oneof![
+            8 => -4.0..4.0_f64,
+            1 => Just(f64::NAN),
+            1 => Just(f64::INFINITY),
+            1 => Just(f64::NEG_INFINITY),
+            1 => Just(1e300),
+        ]
+    }
+
+    proptest! {
+        #[test]
+        fn limits_are_never_exceeded(
+            targets in prop::collection::vec((prop::collection::vec(adversarial(), 16), 1usize..40, 0.0..9.0_f64, any::<bool>()), 1..30),
+            smoothing in prop_oneof![Just(0.0), 0.001..0.05_f64],
+            start in prop::collection::vec(-3.0..3.0_f64, 16),
+        ) {
+            let hand = hand();
+            let mut conditioner = Conditioner::new(&hand, &JointVector::from_slice(&start), PERIOD, smoothing);
+            let (mut q, mut v) = (*conditioner.position(), *conditioner.velocity());
+            for (target, ticks, speed, hold) in targets {
+                let target = JointVector::from_slice(&target);
+                for _ in 0..ticks {
+                    if hold { conditioner.hold() } else { conditioner.follow(&target, speed) }
+                    let (next, velocity) = (*conditioner.position(), *conditioner.velocity());
+                    for (joint, limits) in hand.joints.iter().enumerate() {
+                        prop_assert!(next[joint] >= limits.lower && next[joint] <= limits.upper);
+                        prop_assert!(velocity[joint].abs() <= limits.velocity + 1e-12);
+                        prop_assert!((next[joint] - q[joint]).abs() <= limits.velocity * PERIOD + 1e-12);
+                        let acceleration = (velocity[joint] - v[joint]) / PERIOD;
+                        prop_assert!(acceleration.abs() <= limits.acceleration * (1.0 + 1e-9) + 1e-6,
+                            "joint {} from {} to {}", joint, v[joint], velocity[joint]);
+                    }
+                    (q, v) = (next, velocity);
+                }
+            }
+        }
+
+        #[test]
+        fn arrives_and_never_overshoots_a_still_target(target in prop::collection::vec(-0.4..1.6_f64, 16)) {
+            let hand = hand();
+            let target = hand.clip(&JointVector::from_slice(&target));
+            let mut conditioner = Conditioner::new(&hand, &hand.home(), PERIOD, 0.01);
+            let start = *conditioner.position();
+            for _ in 0..1000 {
+                conditioner.follow(&target, f64::INFINITY);
+                for joint in 0..16 {
+                    let way = (target[joint] - start[joint]).signum();
+                    prop_assert!((target[joint] - conditioner.position()[joint]) * way >= -1e-9);
+                }
+            }
+            for joint in 0..16 {
+                prop_assert!((target[joint] - conditioner.position()[joint]).abs() < 1e-6);
+            }
+        }
+    }
+
+    #[test]
+    fn a_slow_target_is_followed_without_lag_of_the_limiter() {
+        let hand = hand();
+        let mut conditioner = Conditioner::new(&hand, &hand.home(), PERIOD, 0.0);
+        let mut target = hand.home();
+        for tick in 0..500 {
+            target[1] = hand.home()[1] + 0.5 * (1.0 - (f64::from(tick) * PERIOD * 4.0).cos());
+            conditioner.follow(&target, f64::INFINITY);
+            if tick > 10 {
+                assert!((conditioner.position()[1] - target[1]).abs() < 1e-9);
+            }
+        }
+    }
+
+    #[test]
+    fn hold_stops_within_the_braking_distance() {
+        let hand = hand();
+        let mut conditioner = Conditioner::new(&hand, &hand.home(), PERIOD, 0.0);
+        let mut target = hand.home();
+        target[2] = 1.6;
+        for _ in 0..30 {
+            conditioner.follow(&target, f64::INFINITY);
+        }
+        let (from, velocity) = (conditioner.position()[2], conditioner.velocity()[2]);
+        assert!(velocity > 1.0);
+        let mut ticks = 0;
+        while !conditioner.at_rest() {
+            conditioner.hold();
+            ticks += 1;
+            assert!(ticks < 1000, "never came to rest");
+        }
+        let acceleration = hand.joints[2].acceleration;
+        assert!(conditioner.position()[2] - from <= velocity * velocity / (2.0 * acceleration) + velocity * PERIOD);
+    }
+}
