@@ -8,9 +8,23 @@
 //! distal and palmar, for either hand; for a left hand that makes it left-handed, which is what lets the mapping be
 //! written once.
 
+mod allegro;
+mod description;
+mod error;
+mod joint_map;
+mod link;
+mod load;
 mod model;
+mod urdf;
 mod vector;
+mod xml;
 
+pub use allegro::{
+    ALLEGRO_V4_LEFT_DESCRIPTION, ALLEGRO_V4_LEFT_URDF, ALLEGRO_V4_RIGHT_DESCRIPTION, ALLEGRO_V4_RIGHT_URDF,
+    allegro_v4_texts,
+};
+pub use error::HandError;
+pub use link::{Link, Shape, Visual};
 pub use model::{ChainJoint, FingerChain, HandModel, Joint, JointMap, JointMapTerm, TipFrame, TipJacobian};
 pub use vector::JointVector;
 

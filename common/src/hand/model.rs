@@ -1,6 +1,6 @@
 use nalgebra::{Matrix3, Vector3};
 
-use super::{Finger, HandSide, JointVector, MAX_FINGER_JOINTS};
+use super::{Finger, HandSide, JointVector, Link, MAX_FINGER_JOINTS};
 
 /// One actuated joint of the hand.
 #[derive(Clone, Debug)]
@@ -209,6 +209,10 @@ pub struct HandModel {
     pub anatomical_from_palm: Matrix3<f64>,
     /// The joint maps the description offers.
     pub joint_maps: Vec<JointMap>,
+    /// All links with their shapes, for drawing: the root (the palm frame) first, parents before children.
+    pub links: Vec<Link>,
+    /// What the texts contain but the model leaves out, for the caller to log.
+    pub warnings: Vec<String>,
 }
 
 impl HandModel {
