@@ -10,12 +10,18 @@
 //! | [`master`] | the human hand: the paradigmatic 20-joint model, keypoint fit, calibration, gestures |
 //! | [`mapping`] | the combined joint-Cartesian mapping, Eq. 1-14 |
 //! | [`ik`] | bounded lexicographic inverse kinematics of one finger |
-//! | [`time`] | monotonic time as a number |
+//! | [`mode`] | what the robot is doing |
+//! | [`key`] | key expressions of a robot |
+//! | [`wire`] | the binary messages and their one codec door |
+//! | [`time`] | monotonic time as a number, clock offset, latency histogram |
 //! | [`testing`] | where tests find recordings |
 
 pub mod hand;
 pub mod ik;
+pub mod key;
 pub mod mapping;
 pub mod master;
+pub mod mode;
 pub mod testing;
 pub mod time;
+pub mod wire;

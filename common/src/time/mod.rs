@@ -1,8 +1,14 @@
 //! Time as a number: the core never reads a clock.
 
+mod offset;
+mod stats;
+
 use std::time::Duration;
 
-/// Nanoseconds of a process's monotonic clock. Two processes' values do not compare without a clock offset.
+pub use offset::{ClockError, ClockOffset, Exchange, OffsetEstimate};
+pub use stats::Histogram;
+
+/// Nanoseconds of a process's monotonic clock. Two processes' values do not compare without a [`ClockOffset`].
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash, serde::Serialize, serde::Deserialize)]
 pub struct MonoTime(pub u64);
 
