@@ -1,8 +1,9 @@
 //! The human (master) hand: the paradigmatic hand of 20 joints.
 //!
-//! Frame O_W: x radial (towards the thumb side), y distal, z palmar, for either hand. Joint order: thumb, index,
-//! middle, ring, little, four each: abduction, MCP flexion, PIP, DIP (thumb: CMC rotation, CMC flexion, MCP, IP).
+//! Frame O_W: origin at the wrist, x radial (towards the thumb side), y distal, z palmar, for either hand. Joint
+//! order: thumb, index, middle, ring, little, four each: abduction, MCP flexion, PIP, DIP (thumb: CMC rotation, CMC
+//! flexion, MCP, IP).
 
 mod model;
 
-pub use model::{MasterGeometry, MasterPose};
+pub use model::{FingerJacobian, JOINT_LIMITS, JointRange, MAX_ANGLE, MasterError, MasterGeometry, MasterPose};
