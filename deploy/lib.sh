@@ -8,9 +8,9 @@ target=${CARGO_TARGET_DIR:-target}
 # The Rust version of the lock file and the lints. A machine that cannot download it may have the very same version under
 # a moving name such as `stable`; then that is used.
 channel=$(sed -n 's/^channel *= *"\(.*\)"/\1/p' rust-toolchain.toml)
-if command -v rustup >/dev/null && ! rustup toolchain list | grep -q "^$channel\b"; then
+if command -v rustup >/dev/null && ! grep -q "^$channel\b" <<<"$(rustup toolchain list)"; then
   for name in $(rustup toolchain list | cut -d ' ' -f 1); do
-    if rustc "+$name" --version 2>/dev/null | grep -q "^rustc ${channel//./\\.} "; then
+    if grep -q "^rustc ${channel//./\\.} " <<<"$(rustc "+$name" --version 2>/dev/null)"; then
       export RUSTUP_TOOLCHAIN=$name
       break
     fi
