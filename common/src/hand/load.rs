@@ -215,10 +215,9 @@ fn finger(
         }
     }
     let to_center = path("center", &entry.center)?;
-    for (key, link, joints) in [
-        ("center", &entry.center, &to_center),
-        ("pole", &entry.pole, &path("pole", &entry.pole)?),
-    ] {
+    for (key, link, joints) in
+        [("center", &entry.center, &to_center), ("pole", &entry.pole, &path("pole", &entry.pole)?)]
+    {
         let moving: Vec<_> = joints.iter().filter(|joint| joint.motion.is_some()).map(|joint| &joint.name).collect();
         if !moving.iter().copied().eq(&entry.joints) {
             let mut problem = format!("joints must be those that lead to its {key} '{link}', from the palm outwards:");

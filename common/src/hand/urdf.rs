@@ -53,8 +53,10 @@ pub(super) struct Motion {
 impl Tree {
     pub(super) fn parse(text: &str) -> Result<Self, HandError> {
         check_plain(text).map_err(HandError::UrdfSyntax)?;
-        let robot =
-            urdf_rs::read_from_string(text).map_err(|error| HandError::UrdfSyntax(brief(&error.to_string())))?;
+        // The parser has panics of its own, for example where a document binds the prefix xmlns anew.
+        let robot = std::panic::catch_unwind(|| urdf_rs::read_from_string(text))
+            .map_err(|_| HandError::UrdfSyntax("the xml parser gave up; simplify the document".to_owned()))?
+            .map_err(|error| HandError::UrdfSyntax(brief(&error.to_string())))?;
         let links = link_indices(&robot.links)?;
 
         let mut parents: Vec<Option<(usize, TreeJoint)>> = vec![None; robot.links.len()];

@@ -58,7 +58,7 @@ pub(super) fn check_plain(text: &str) -> Result<(), String> {
 
 /// Text of the file, shortened for a message.
 pub(super) fn brief(text: &str) -> String {
-    const LONGEST: usize = 80;
+    const LONGEST: usize = 200;
     match text.char_indices().nth(LONGEST) {
         Some((end, _)) => format!("{}...", &text[..end]),
         None => text.to_owned(),
