@@ -12,10 +12,22 @@ fn denavit_hartenberg(alpha: f64, a: f64, theta: f64) -> Matrix4<f64> {
     let (s, c) = theta.sin_cos();
     let (sa, ca) = alpha.sin_cos();
     Matrix4::new(
-        c, -s * ca, s * sa, a * c, //
-        s, c * ca, -c * sa, a * s, //
-        0.0, sa, ca, 0.0, //
-        0.0, 0.0, 0.0, 1.0,
+        c,
+        -s * ca,
+        s * sa,
+        a * c, //
+        s,
+        c * ca,
+        -c * sa,
+        a * s, //
+        0.0,
+        sa,
+        ca,
+        0.0, //
+        0.0,
+        0.0,
+        0.0,
+        1.0,
     )
 }
 
