@@ -22,6 +22,10 @@ pub mod key;
 pub mod mapping;
 pub mod master;
 pub mod mode;
+#[cfg(feature = "net")]
+pub mod net;
 pub mod testing;
 pub mod time;
+#[cfg(feature = "viz")]
+pub mod viz;
 pub mod wire;

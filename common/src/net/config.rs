@@ -1,0 +1,122 @@
+use std::path::PathBuf;
+use std::time::Duration;
+
+use zenoh::Config;
+use zenoh::config::EndPoint;
+
+use super::NetError;
+
+/// Silence after which a link counts as dead. zenoh closes it then, and what an outage kept in buffers is lost with
+/// it instead of arriving late.
+pub const DEFAULT_LEASE: Duration = Duration::from_millis(1000);
+
+/// Longest message zenoh may put together from fragments, bytes.
+const MAX_MESSAGE_SIZE: usize = 65_536;
+
+/// Where a session listens and connects; everything else is set for a robot, not for a data centre.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct SessionConfig {
+    /// Endpoints to listen on, such as `tcp/127.0.0.1:7447`; port 0 lets the system choose, see
+    /// [`super::Session::locators`]. None: nobody can connect to this process.
+    pub listen: Vec<String>,
+    /// Endpoints to connect to; tried for ever, every 0.2 to 2 s, also after a connection was lost.
+    pub connect: Vec<String>,
+    /// A zenoh configuration (JSON5 or YAML) for certificates, access control and link options.
+    ///
+    /// Its endpoints count where the list above is empty. What keeps old commands and strangers out is set over it:
+    /// peer mode, no discovery, lease, message size, retry.
+    pub zenoh_config_file: Option<PathBuf>,
+    /// Silence after which a link counts as dead, [`DEFAULT_LEASE`]. Both ends should agree.
+    pub lease: Duration,
+}
+
+impl Default for SessionConfig {
+    fn default() -> Self {
+        Self { listen: Vec::new(), connect: Vec::new(), zenoh_config_file: None, lease: DEFAULT_LEASE }
+    }
+}
+
+impl SessionConfig {
+    /// A session that listens on `endpoints` and connects nowhere.
+    pub fn listening<S: Into<String>>(endpoints: impl IntoIterator<Item = S>) -> Self {
+        Self { listen: endpoints.into_iter().map(Into::into).collect(), ..Self::default() }
+    }
+
+    /// A session that connects to `endpoints` and listens nowhere.
+    pub fn connecting<S: Into<String>>(endpoints: impl IntoIterator<Item = S>) -> Self {
+        Self { connect: endpoints.into_iter().map(Into::into).collect(), ..Self::default() }
+    }
+
+    pub(super) fn zenoh(&self) -> Result<Config, NetError> {
+        let mut config = match &self.zenoh_config_file {
+            None => Config::default(),
+            Some(path) => Config::from_file(path)
+                .map_err(|error| NetError::ConfigFile { path: path.clone(), reason: error.to_string() })?,
+        };
+        // An absent file means "listen nowhere", not zenoh's default of all interfaces.
+        if !self.listen.is_empty() || self.zenoh_config_file.is_none() {
+            set(&mut config, "listen/endpoints", &endpoints(&self.listen)?)?;
+        }
+        if !self.connect.is_empty() {
+            set(&mut config, "connect/endpoints", &endpoints(&self.connect)?)?;
+        }
+        set(&mut config, "mode", "\"peer\"")?;
+        set(&mut config, "scouting/multicast/enabled", "false")?;
+        set(&mut config, "scouting/gossip/enabled", "false")?;
+        set(&mut config, "listen/timeout_ms", "0")?;
+        set(&mut config, "listen/exit_on_failure", "true")?;
+        set(&mut config, "connect/timeout_ms", "-1")?;
+        set(&mut config, "connect/exit_on_failure", "false")?;
+        let retry = r#"{"period_init_ms": 200, "period_max_ms": 2000, "period_increase_factor": 1.5}"#;
+        set(&mut config, "connect/retry", retry)?;
+        set(&mut config, "transport/link/tx/lease", &self.lease.as_millis().to_string())?;
+        set(&mut config, "transport/link/rx/max_message_size", &MAX_MESSAGE_SIZE.to_string())?;
+        set(&mut config, "transport/unicast/max_sessions", "16")?;
+        set(&mut config, "transport/unicast/open_timeout", "3000")?;
+        set(&mut config, "transport/unicast/accept_timeout", "3000")?;
+        Ok(config)
+    }
+}
+
+/// Endpoints as the JSON list that zenoh's settings take.
+fn endpoints(list: &[String]) -> Result<String, NetError> {
+    for endpoint in list {
+        endpoint
+            .parse::<EndPoint>()
+            .map_err(|error| NetError::Endpoint { endpoint: endpoint.clone(), reason: error.to_string() })?;
+    }
+    Ok(serde_json::Value::from(list).to_string())
+}
+
+fn set(config: &mut Config, setting: &'static str, value: &str) -> Result<(), NetError> {
+    config.insert_json5(setting, value).map_err(|error| NetError::Setting { setting, reason: error.to_string() })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn settings_are_taken() {
+        let config = SessionConfig::connecting(["tcp/127.0.0.1:7447"]).zenoh().unwrap();
+        let get = |key: &str| config.get_json(key).unwrap();
+        assert_eq!(get("mode"), "\"peer\"");
+        assert_eq!(get("listen/endpoints"), "[]");
+        assert_eq!(get("connect/endpoints"), "[\"tcp/127.0.0.1:7447\"]");
+        assert_eq!(get("transport/link/tx/lease"), "1000");
+        assert_eq!(get("scouting/multicast/enabled"), "false");
+    }
+
+    #[test]
+    fn bad_endpoint_is_named() {
+        let error = SessionConfig::listening(["127.0.0.1:7447"]).zenoh().unwrap_err().to_string();
+        assert!(error.contains("\"127.0.0.1:7447\"") && error.contains("tcp/"), "{error}");
+    }
+
+    #[test]
+    fn bad_file_is_named() {
+        let config = SessionConfig { zenoh_config_file: Some("/nowhere/zenoh.json5".into()), ..Default::default() };
+        let error = config.zenoh().unwrap_err().to_string();
+        assert!(error.contains("/nowhere/zenoh.json5"), "{error}");
+    }
+}

@@ -1,0 +1,86 @@
+use std::path::PathBuf;
+
+use thiserror::Error;
+
+use crate::wire::WireError;
+
+/// Why something on the network did not work. zenoh's own words are at the end of each message.
+#[derive(Debug, Error)]
+pub enum NetError {
+    /// The zenoh configuration file is not one.
+    #[error("zenoh configuration {path}: {reason}", path = path.display())]
+    ConfigFile {
+        /// The file.
+        path: PathBuf,
+        /// What zenoh says.
+        reason: String,
+    },
+    /// An endpoint is not one.
+    #[error("endpoint {endpoint:?} is not valid, write for example tcp/127.0.0.1:7447 or udp/10.0.0.2:7447: {reason}")]
+    Endpoint {
+        /// The endpoint.
+        endpoint: String,
+        /// What zenoh says.
+        reason: String,
+    },
+    /// A setting was refused.
+    #[error("zenoh does not take the setting {setting}: {reason}")]
+    Setting {
+        /// Path of the setting.
+        setting: &'static str,
+        /// What zenoh says.
+        reason: String,
+    },
+    /// The session does not open.
+    #[error(
+        "cannot open a session listening on {listen:?}, connecting to {connect:?}: is the port taken by another \
+         process, or the address not of this machine? Choose another endpoint ({reason})"
+    )]
+    Open {
+        /// Endpoints to listen on.
+        listen: Vec<String>,
+        /// Endpoints to connect to.
+        connect: Vec<String>,
+        /// What zenoh says.
+        reason: String,
+    },
+    /// A declaration or an exchange on a key failed.
+    #[error("cannot {action} {key}: {reason}")]
+    Key {
+        /// What was tried.
+        action: &'static str,
+        /// On which key.
+        key: String,
+        /// What zenoh says.
+        reason: String,
+    },
+    /// The message is not fit to be sent.
+    #[error("message for {key} not sent: {error}")]
+    Message {
+        /// On which key.
+        key: String,
+        /// Why.
+        error: WireError,
+    },
+    /// Nobody answers a query.
+    #[error("nobody answers {key} within {timeout_ms} ms: is the robot running, and are name and endpoint right?")]
+    NoAnswer {
+        /// The key asked.
+        key: String,
+        /// For how long, ms.
+        timeout_ms: u128,
+    },
+    /// The answer is longer than anything this side would take.
+    #[error("answer to {key} of {found} bytes is longer than {allowed}")]
+    LongAnswer {
+        /// The key asked.
+        key: String,
+        /// Length, bytes.
+        found: usize,
+        /// Longest allowed, bytes.
+        allowed: usize,
+    },
+    /// The session does not close.
+    #[error("cannot close the session: {0}")]
+    Close(String),
+}

@@ -1,0 +1,95 @@
+//! One message of each kind, every field with a value of its own.
+
+#![allow(dead_code, unreachable_pub, reason = "each test takes what it needs")]
+
+use nalgebra::Vector3;
+use teleop_common::hand::{Finger, JointVector};
+use teleop_common::ik::{IkReport, IkStatus};
+use teleop_common::mapping::{FingerSignals, MappingOutput};
+use teleop_common::master::{MasterGeometry, MasterPose};
+use teleop_common::time::MonoTime;
+use teleop_common::wire::{
+    Echo, Header, HealthMessage, JointStateMessage, MappingMessage, PoseMessage, Quantiles, pack_joints,
+};
+
+pub const EPOCH: u64 = 0x0123_4567_89ab_cdef;
+pub const PEER: u64 = 0xfedc_ba98_7654_3210;
+
+pub fn echo() -> Echo {
+    Echo { epoch: PEER, sent: MonoTime(1_000_000_007), received: MonoTime(2_000_000_011) }
+}
+
+pub fn master_pose() -> MasterPose {
+    MasterPose { q: std::array::from_fn(|joint| 0.05 * joint as f64 - 0.25), geometry: MasterGeometry::PARADIGMATIC }
+}
+
+pub fn pose() -> PoseMessage {
+    let header = Header::new::<PoseMessage>(EPOCH, 42, MonoTime(3_000_000_019));
+    PoseMessage::new(header, echo(), MonoTime(2_999_000_000), &master_pose())
+}
+
+pub fn joint_state() -> JointStateMessage {
+    let ramp = |start: f64| pack_joints(&std::array::from_fn::<f64, 16, _>(|joint| start + 0.125 * joint as f64));
+    JointStateMessage {
+        header: Header::new::<JointStateMessage>(EPOCH, 43, MonoTime(4_000_000_037)),
+        echo: echo(),
+        mode: 1,
+        joints: 16,
+        tick: 123_456,
+        wall_offset_ns: -1_700_000_000_123_456_789,
+        pose_epoch: PEER,
+        pose_seq: 41,
+        pose_captured: MonoTime(1_999_000_000),
+        q: ramp(-1.0),
+        dq: ramp(-0.5),
+        tau: ramp(0.25),
+        q_command: ramp(0.5),
+    }
+}
+
+pub fn mapping_output() -> MappingOutput {
+    let signals = [Finger::Thumb, Finger::Index, Finger::Middle, Finger::Ring].map(|finger| {
+        let base = 0.01 * (1.0 + finger.index() as f64);
+        FingerSignals {
+            finger,
+            delta: base,
+            k: 0.25 * finger.index() as f64,
+            p_joint: Vector3::new(base, -base, 0.5),
+            p_cartesian: Vector3::new(base, base, 0.25),
+            p_input: Vector3::new(-base, base, 0.125),
+            p: Vector3::new(-base, -base, 0.0625),
+            e_q: base * 10.0,
+            e_c: base * 0.5,
+            ik: IkReport {
+                status: [IkStatus::Skipped, IkStatus::Reached, IkStatus::Unreachable, IkStatus::Budget]
+                    [finger.index()],
+                residual: base * 0.1,
+                ..IkReport::default()
+            },
+        }
+    });
+    let q = JointVector::from_slice(&std::array::from_fn::<f64, 16, _>(|joint| 0.1 * joint as f64 - 0.5));
+    MappingOutput::new(q, q, &signals)
+}
+
+pub fn mapping() -> MappingMessage {
+    let header = Header::new::<MappingMessage>(EPOCH, 44, MonoTime(5_000_000_041));
+    MappingMessage::new(header, 123_457, 0.02, 0.04, &mapping_output())
+}
+
+pub fn health() -> HealthMessage {
+    HealthMessage {
+        header: Header::new::<HealthMessage>(EPOCH, 45, MonoTime(6_000_000_043)),
+        mode: 2,
+        fault: 7,
+        ticks: 1_000_001,
+        overruns: 17,
+        tick_us: Quantiles { p50: 21.5, p99: 40.25, max: 97.75 },
+        poses_accepted: 9_001,
+        rejected: [1, 2, 3, 4, 5, 6, 7, 8],
+        holds: 3,
+        age_ms: Quantiles { p50: 20.5, p99: 26.25, max: 31.75 },
+        telemetry_dropped: 11,
+        rate_hz: 333.25,
+    }
+}
