@@ -51,8 +51,8 @@ impl Publisher {
     /// the network drops is no error.
     pub fn send<M: Message>(&self, message: &M) -> Result<(), NetError> {
         let mut buffer = [0; MAX_MESSAGE];
-        let len = encode_into(message, &mut buffer)
-            .map_err(|error| NetError::Message { key: self.key.clone(), error })?;
+        let len =
+            encode_into(message, &mut buffer).map_err(|error| NetError::Message { key: self.key.clone(), error })?;
         self.put(&buffer[..len])
     }
 

@@ -56,9 +56,7 @@ pub(super) fn get(session: &zenoh::Session, key: &str, timeout: Duration) -> Res
     match receiver.recv_timeout(timeout + Duration::from_millis(100)) {
         Ok(Ok(answer)) => Ok(answer),
         Ok(Err(Refusal::Said(reason))) => Err(failed("query", key, &reason)),
-        Ok(Err(Refusal::Long(found))) => {
-            Err(NetError::LongAnswer { key: key.to_owned(), found, allowed: MAX_ANSWER })
-        }
+        Ok(Err(Refusal::Long(found))) => Err(NetError::LongAnswer { key: key.to_owned(), found, allowed: MAX_ANSWER }),
         Err(_nothing_came) => Err(NetError::NoAnswer { key: key.to_owned(), timeout_ms: timeout.as_millis() }),
     }
 }

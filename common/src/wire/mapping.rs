@@ -178,7 +178,11 @@ impl Message for MappingMessage {
             finger.check()?;
         }
         if let Some(finger) = self.signals[fingers..].iter().find(|finger| **finger != FingerMessage::default()) {
-            return Err(WireError::Code { field: "finger", value: finger.finger, allowed: "0 in all fields (padding)" });
+            return Err(WireError::Code {
+                field: "finger",
+                value: finger.finger,
+                allowed: "0 in all fields (padding)",
+            });
         }
         Ok(())
     }

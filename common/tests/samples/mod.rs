@@ -61,8 +61,7 @@ pub fn mapping_output() -> MappingOutput {
             e_q: base * 10.0,
             e_c: base * 0.5,
             ik: IkReport {
-                status: [IkStatus::Skipped, IkStatus::Reached, IkStatus::Unreachable, IkStatus::Budget]
-                    [finger.index()],
+                status: [IkStatus::Skipped, IkStatus::Reached, IkStatus::Unreachable, IkStatus::Budget][finger.index()],
                 residual: base * 0.1,
                 ..IkReport::default()
             },
