@@ -21,7 +21,7 @@ const LIMITS: [[(f64, f64); 4]; 2] = [
 const HOME: [f64; 16] = [0., -10., 45., 45., 0., -10., 45., 45., 5., -5., 50., 45., 60., 25., 15., 45.];
 
 fn finger(hand: &HandModel, finger: Finger) -> &FingerChain {
-    hand.fingers.iter().find(|chain| chain.finger == finger).unwrap()
+    hand.fingers.iter().find(|chain| chain.finger == finger).expect("the hand has this finger")
 }
 
 fn tip(hand: &HandModel, name: Finger, q: &[f64], frame: TipFrame) -> Vector3<f64> {

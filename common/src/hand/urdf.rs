@@ -225,7 +225,6 @@ fn materials(robot: &urdf_rs::Robot) -> Result<HashMap<&str, [f32; 4]>, HandErro
     Ok(colours)
 }
 
-#[expect(clippy::cast_possible_truncation, reason = "colours need no more")]
 fn check_colour(name: &str, rgba: [f64; 4]) -> Result<[f32; 4], HandError> {
     if rgba.iter().all(|value| (0.0..=1.0).contains(value)) {
         return Ok(rgba.map(|value| value as f32));
