@@ -27,6 +27,10 @@ pub const REACHED: f64 = 1e-6;
 // mu, m/rad. The first is where position and posture weigh alike for a finger of this size; the last decides the bias.
 const POSTURE_WEIGHTS: [f64; 3] = [3e-3, 3e-4, 2e-5];
 const ITERATIONS_PER_WEIGHT: u16 = 14;
+// Ways tried besides the one from the given start.
+const SEEDS: usize = 3;
+// A relative decrease of the weighted sum smaller than this ends a stage whose target is out of reach.
+const SETTLED: f64 = 1e-11;
 // A step smaller than this (rad) ends a stage.
 const STEP_TOLERANCE: [f64; 3] = [1e-3, 1e-4, 1e-9];
 
@@ -82,13 +86,13 @@ impl FingerIk {
     }
 
     /// Most iterations one [`FingerIk::solve`] can take.
-    pub const MAX_ITERATIONS: u16 = 2 * ITERATIONS_PER_WEIGHT * POSTURE_WEIGHTS.len() as u16;
+    pub const MAX_ITERATIONS: u16 = (1 + SEEDS as u16) * ITERATIONS_PER_WEIGHT * POSTURE_WEIGHTS.len() as u16;
 
     /// Joint angles (rad, palm outwards) that bring the pole of `chain` to `target` (m, palm frame), as close to
     /// `reference` as the target allows; `start` is where to begin, best the last solution.
     ///
     /// Does not allocate; at most [`FingerIk::MAX_ITERATIONS`] iterations. If the way from `start` does not reach the
-    /// target, the way from `reference` is tried too and the better one returned.
+    /// target, the ways from `reference` and from a few fixed postures are tried too and the best end returned.
     #[must_use]
     pub fn solve(
         &self,
@@ -98,22 +102,19 @@ impl FingerIk {
         start: &[f64; N],
     ) -> ([f64; N], IkReport) {
         let reference = Vector::from(*reference);
-        let first = self.descend(chain, target, &reference, &Vector::from(*start));
-        let first_residual = self.residual(chain, target, &first.q);
-        let (mut best, mut residual) = (first, first_residual);
-        if first_residual > REACHED && reference != Vector::from(*start) {
-            let second = self.descend(chain, target, &reference, &reference);
-            let iterations = best.iterations + second.iterations;
-            let second_residual = self.residual(chain, target, &second.q);
-            let better = if (second_residual - residual).abs() <= REACHED {
-                (second.q - reference).norm_squared() < (best.q - reference).norm_squared()
-            } else {
-                second_residual < residual
-            };
-            if better {
-                (best, residual) = (second, second_residual);
+        let mut best = self.descend(chain, target, &reference, &Vector::from(*start));
+        let mut residual = self.residual(chain, target, &best.q);
+        let mut iterations = best.iterations;
+        for seed in 0..SEEDS {
+            if residual <= REACHED {
+                break;
             }
-            best.iterations = iterations;
+            let other = self.descend(chain, target, &reference, &self.seed(seed, &reference));
+            let other_residual = self.residual(chain, target, &other.q);
+            iterations += other.iterations;
+            if other_residual < residual - REACHED {
+                (best, residual) = (other, other_residual);
+            }
         }
         let status = if residual <= REACHED {
             IkStatus::Reached
@@ -122,7 +123,16 @@ impl FingerIk {
         } else {
             IkStatus::Budget
         };
-        (best.q.into(), IkReport { status, iterations: best.iterations, residual })
+        (best.q.into(), IkReport { status, iterations, residual })
+    }
+
+    /// Where to begin anew: the reference, then half and fully curled postures.
+    fn seed(&self, seed: usize, reference: &Vector) -> Vector {
+        match seed {
+            0 => *reference,
+            1 => (self.lower + self.upper) * 0.5,
+            _ => self.lower * 0.2 + self.upper * 0.8,
+        }
     }
 
     fn residual(&self, chain: &FingerChain, target: &Vector3<f64>, q: &Vector) -> f64 {
@@ -179,10 +189,15 @@ impl FingerIk {
             let trial_residual = trial_state.0 - target;
             let trial_value = cost(&trial_residual, &trial);
             if trial_value < value {
+                let settled = value - trial_value < SETTLED * value && damping == 0.0;
                 (q, state, residual, value) = (trial, trial_state, trial_residual, trial_value);
                 damping *= 0.1;
                 if damping < 1e-8 {
                     damping = 0.0;
+                }
+                if settled && residual.norm_squared() > REACHED * REACHED {
+                    // Out of reach and nothing left to gain.
+                    return (q, iteration + 1, true);
                 }
             } else if moved < 1e-7 {
                 // Down to rounding: no decrease is left to find.

@@ -175,7 +175,7 @@ impl Drop for ControlThread {
 
 fn raise_priority() -> Result<(), String> {
     // Any real-time priority passes all ordinary threads; 80 leaves room above for the kernel's own.
-    let value = ThreadPriorityValue::try_from(80).map_err(str::to_owned)?;
+    let value = ThreadPriorityValue::try_from(80).map_err(|error| format!("{error:?}"))?;
     set_thread_priority_and_policy(
         thread_native_id(),
         ThreadPriority::Crossplatform(value),
