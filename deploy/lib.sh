@@ -1,3 +1,4 @@
+# shellcheck shell=bash disable=SC2034 # used where it is sourced
 # What the scripts of this folder share. Sourced, never run; it also makes the workspace root the current folder.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
@@ -17,7 +18,7 @@ if command -v rustup >/dev/null && ! grep -q "^$channel\b" <<<"$(rustup toolchai
   done
 fi
 
-say() { printf '%s\n' "$*"; }
+say() { printf '%s\n' "$@"; }
 
 # die MESSAGE [EXIT-CODE]: exit codes as those of the binaries, 1 a fault at run time, 2 wrong usage.
 die() {
