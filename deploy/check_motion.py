@@ -28,7 +28,8 @@ def main():
     parser.add_argument("--mode")
     arguments = parser.parse_args()
 
-    states = [json.loads(line) for line in sys.stdin if line.strip()]
+    # A line without joints is of a robot whose first state has not arrived yet.
+    states = [state for state in map(json.loads, sys.stdin) if "q" in state]
     if len(states) < 10:
         fail(f"{len(states)} states are too few to judge by: is the robot running?")
     ranges = [max(joint) - min(joint) for joint in zip(*(state["q"] for state in states), strict=True)]
