@@ -147,6 +147,12 @@ fn poisoned<M: Message>(message: &M, at: usize, value: &[u8]) -> Result<Checked<
 }
 
 #[track_caller]
+fn bad_pose(at: usize, value: f32, says: &str) {
+    let error = poisoned(&pose(), at, &value.to_le_bytes()).unwrap_err();
+    assert!(matches!(error, WireError::Pose(_)) && error.to_string().contains(says), "{error}");
+}
+
+#[track_caller]
 fn rejected<M: Message>(message: &M, at: usize, value: &[u8], field: &str) {
     let error = poisoned(message, at, value).map(|_| ()).unwrap_err();
     let (WireError::Value { field: found, .. } | WireError::Code { field: found, .. }) = error else {
@@ -162,7 +168,8 @@ fn every_float_must_be_finite() {
         for at in floats {
             for value in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY, f32::MAX, f32::MIN] {
                 let error = poisoned(message, at, &value.to_le_bytes()).map(|_| ()).unwrap_err();
-                assert!(matches!(error, WireError::Value { .. } | WireError::Code { .. }), "{at}: {error}");
+                let value = matches!(error, WireError::Value { .. } | WireError::Code { .. } | WireError::Pose(_));
+                assert!(value, "{at}: {error}");
             }
         }
     }
@@ -177,15 +184,14 @@ fn every_float_must_be_finite() {
 #[test]
 fn values_out_of_range() {
     let f = |value: f32| value.to_le_bytes();
-    let pose = pose();
-    rejected(&pose, 64, &f(6.2832), "q");
-    rejected(&pose, 204, &f(0.0029), "phalanges");
-    rejected(&pose, 204, &f(0.151), "phalanges");
-    rejected(&pose, 144, &f(0.251), "bases");
-    rejected(&pose, 144 + 4, &f(0.249), "bases"); // with its x of 0.037 the norm is 0.2517
-    rejected(&pose, 144 + 12 * 2, &f(0.0241), "bases"); // middle beyond index
-    rejected(&pose, 144 + 12 * 3, &f(0.008), "bases"); // ring where middle is
-    rejected(&pose, 144 + 12 * 4, &f(0.0), "bases"); // little beyond ring
+    bad_pose(64, 6.2832, "joint 0 of the thumb");
+    bad_pose(204, 0.0029, "phalanx 0 of the thumb");
+    bad_pose(204 + 12 * 4 + 8, 0.151, "phalanx 2 of the little");
+    bad_pose(144, 0.251, "base of the thumb");
+    bad_pose(144 + 4, 0.249, "base of the thumb"); // with its x of 0.037 the norm is 0.2517
+    bad_pose(144 + 12 * 2, 0.0241, "index"); // middle beyond index
+    bad_pose(144 + 12 * 3, 0.008, "ring"); // ring where middle is
+    bad_pose(144 + 12 * 4, 0.0, "little"); // little beyond ring
     let state = joint_state();
     rejected(&state, 56, &[4], "mode");
     rejected(&state, 57, &[0], "joints");
@@ -212,7 +218,7 @@ fn nothing_invalid_is_sent() {
     let mut message = pose();
     message.q[7] = f32::NAN;
     let error = encode_into(&message, &mut [0; MAX_MESSAGE]).unwrap_err();
-    assert_eq!(error.to_string(), "q[7] is NaN, allowed: -2 pi to 2 pi rad");
+    assert_eq!(error.to_string(), "joint 3 of the index is NaN rad; angles are finite and within +-2 pi");
 }
 
 #[test]
@@ -252,7 +258,7 @@ proptest! {
     fn pose_round_trip(
         q in prop::array::uniform20(-6.28_f32..6.28),
         radial in prop::array::uniform5(-0.01_f32..0.01),
-        phalanges in prop::collection::vec(0.003_f32..0.15, 15),
+        phalanges in prop::collection::vec(0.0031_f32..0.149, 15),
         stamps in prop::array::uniform6(any::<u64>()),
     ) {
         let mut message = pose();

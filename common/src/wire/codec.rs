@@ -4,6 +4,7 @@ use serde::de::DeserializeOwned;
 use thiserror::Error;
 
 use super::header::{Header, Kind, MAGIC, PROTOCOL};
+use crate::master::MasterError;
 
 /// No message is longer, bytes. Buffers of this size always suffice.
 pub const MAX_MESSAGE: usize = 1024;
@@ -64,6 +65,9 @@ pub enum WireError {
         /// What would have been right.
         allowed: &'static str,
     },
+    /// No pose of a human hand.
+    #[error(transparent)]
+    Pose(#[from] MasterError),
     /// A code or a count that does not exist.
     #[error("{field} is {value}, allowed: {allowed}")]
     Code {
@@ -107,7 +111,7 @@ pub trait Message: sealed::Sealed + Copy + Serialize + DeserializeOwned {
     /// Whether every value is finite, in range and of a known code.
     ///
     /// # Errors
-    /// [`WireError::Value`] or [`WireError::Code`] naming the first one that is not.
+    /// [`WireError::Value`], [`WireError::Code`] or [`WireError::Pose`] naming the first one that is not.
     fn check(&self) -> Result<(), WireError>;
 }
 

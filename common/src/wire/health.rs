@@ -69,7 +69,7 @@ impl From<&WireError> for Rejection {
     fn from(error: &WireError) -> Self {
         match error {
             WireError::Protocol { .. } => Self::Protocol,
-            WireError::Value { .. } | WireError::Code { .. } => Self::Value,
+            WireError::Value { .. } | WireError::Code { .. } | WireError::Pose(_) => Self::Value,
             _ => Self::Malformed,
         }
     }

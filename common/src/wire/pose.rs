@@ -1,9 +1,7 @@
-use std::f32::consts::TAU;
-
 use serde::{Deserialize, Serialize};
 
 use super::codec::sealed::Sealed;
-use super::{Checked, Echo, Header, Kind, Message, WireError, check};
+use super::{Checked, Echo, Header, Kind, Message, WireError};
 use crate::master::{MasterGeometry, MasterPose};
 use crate::time::MonoTime;
 
@@ -38,17 +36,21 @@ impl PoseMessage {
             phalanges: single(pose.geometry.phalanges),
         }
     }
-}
 
-impl Checked<PoseMessage> {
-    /// The pose.
-    #[must_use]
-    pub fn pose(&self) -> MasterPose {
+    fn to_pose(self) -> MasterPose {
         let double = |rows: [[f32; 3]; 5]| rows.map(|row| row.map(f64::from));
         MasterPose {
             q: self.q.map(f64::from),
             geometry: MasterGeometry { bases: double(self.bases), phalanges: double(self.phalanges) },
         }
+    }
+}
+
+impl Checked<PoseMessage> {
+    /// The pose; it passes [`MasterPose::validate`].
+    #[must_use]
+    pub fn pose(&self) -> MasterPose {
+        self.to_pose()
     }
 }
 
@@ -63,22 +65,6 @@ impl Message for PoseMessage {
     }
 
     fn check(&self) -> Result<(), WireError> {
-        check::within("q", &self.q, -TAU, TAU, "-2 pi to 2 pi rad")?;
-        let within_palm = "finite, within 0.25 m of the wrist";
-        check::within("bases", self.bases.as_flattened(), -0.25, 0.25, within_palm)?;
-        for (finger, &[x, y, z]) in self.bases.iter().enumerate() {
-            if x * x + y * y + z * z > 0.25 * 0.25 {
-                return Err(WireError::Value { field: "bases", index: 3 * finger, value: x, allowed: within_palm });
-            }
-        }
-        // Index, middle, ring, little from the thumb side outwards; a mirrored hand would be mapped crosswise.
-        for finger in 2..5 {
-            let value = self.bases[finger][0];
-            if value >= self.bases[finger - 1][0] {
-                let allowed = "x falling from index to little";
-                return Err(WireError::Value { field: "bases", index: 3 * finger, value, allowed });
-            }
-        }
-        check::within("phalanges", self.phalanges.as_flattened(), 0.003, 0.15, "0.003 to 0.15 m")
+        Ok(self.to_pose().validate()?)
     }
 }
