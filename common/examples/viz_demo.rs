@@ -1,0 +1,2 @@
+//! Lost by accident when the folder was cleaned: write it again.
+fn main() {}
