@@ -1,5 +1,7 @@
 //! The clock offset against simulated clocks and networks: the error is always within what it claims.
 
+#![allow(clippy::unwrap_used, reason = "helpers of tests")]
+
 use std::time::Duration;
 
 use proptest::prelude::*;

@@ -1,6 +1,8 @@
 //! The bytes of each kind of message, so that no change of a layout goes unnoticed: if one of these fails, raise
 //! `PROTOCOL`. Regenerate a vector only after that, with `cargo test -p teleop-common --test wire_golden -- --nocapture`.
 
+#![allow(clippy::unwrap_used, reason = "helpers of tests")]
+
 mod samples;
 
 use std::fmt::Write as _;

@@ -1,5 +1,7 @@
 //! Two sessions over real zenoh on localhost, directly and through a bad network.
 
+#![allow(clippy::unwrap_used, reason = "helpers of tests")]
+
 use std::net::{SocketAddr, TcpListener};
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};

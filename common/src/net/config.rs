@@ -5,10 +5,14 @@ use zenoh::Config;
 use zenoh::config::EndPoint;
 
 use super::NetError;
+use super::error::words;
 
 /// Silence after which a link counts as dead. zenoh closes it then, and what an outage kept in buffers is lost with
 /// it instead of arriving late.
 pub const DEFAULT_LEASE: Duration = Duration::from_millis(1000);
+
+/// The link protocols that are built in.
+const PROTOCOLS: [&str; 4] = ["tcp", "udp", "tls", "quic"];
 
 /// Longest message zenoh may put together from fragments, bytes.
 const MAX_MESSAGE_SIZE: usize = 65_536;
@@ -51,7 +55,7 @@ impl SessionConfig {
         let mut config = match &self.zenoh_config_file {
             None => Config::default(),
             Some(path) => Config::from_file(path)
-                .map_err(|error| NetError::ConfigFile { path: path.clone(), reason: error.to_string() })?,
+                .map_err(|error| NetError::ConfigFile { path: path.clone(), reason: words(&error) })?,
         };
         // An absent file means "listen nowhere", not zenoh's default of all interfaces.
         if !self.listen.is_empty() || self.zenoh_config_file.is_none() {
@@ -81,15 +85,18 @@ impl SessionConfig {
 /// Endpoints as the JSON list that zenoh's settings take.
 fn endpoints(list: &[String]) -> Result<String, NetError> {
     for endpoint in list {
-        endpoint
-            .parse::<EndPoint>()
-            .map_err(|error| NetError::Endpoint { endpoint: endpoint.clone(), reason: error.to_string() })?;
+        let refused = |reason| NetError::Endpoint { endpoint: endpoint.clone(), reason };
+        let parsed = endpoint.parse::<EndPoint>().map_err(|error| refused(words(&error)))?;
+        let protocol = parsed.protocol();
+        if !PROTOCOLS.contains(&protocol.as_str()) {
+            return Err(refused(format!("{protocol} is none of {}", PROTOCOLS.join(", "))));
+        }
     }
     Ok(serde_json::Value::from(list).to_string())
 }
 
 fn set(config: &mut Config, setting: &'static str, value: &str) -> Result<(), NetError> {
-    config.insert_json5(setting, value).map_err(|error| NetError::Setting { setting, reason: error.to_string() })
+    config.insert_json5(setting, value).map_err(|error| NetError::Setting { setting, reason: words(&error) })
 }
 
 #[cfg(test)]
@@ -111,6 +118,8 @@ mod tests {
     fn bad_endpoint_is_named() {
         let error = SessionConfig::listening(["127.0.0.1:7447"]).zenoh().unwrap_err().to_string();
         assert!(error.contains("\"127.0.0.1:7447\"") && error.contains("tcp/"), "{error}");
+        let error = SessionConfig::connecting(["http/127.0.0.1:7447"]).zenoh().unwrap_err().to_string();
+        assert!(error.contains("http is none of tcp, udp, tls, quic"), "{error}");
     }
 
     #[test]

@@ -84,3 +84,30 @@ pub enum NetError {
     #[error("cannot close the session: {0}")]
     Close(String),
 }
+
+/// zenoh's words without the places in its source that it appends to them.
+pub(super) fn words(error: &impl ToString) -> String {
+    let text = error.to_string();
+    let mut rest = text.as_str();
+    let mut out = String::new();
+    while let Some((before, after)) = rest.split_once(" at /") {
+        out.push_str(before);
+        // The place ends with the line number: `src/tcp.rs:61.`
+        rest = after.split_once(".rs:").map_or("", |(_, line)| line.trim_start_matches(|c: char| c.is_ascii_digit()));
+        rest = rest.strip_prefix('.').unwrap_or(rest);
+    }
+    out + rest
+}
+
+#[cfg(test)]
+mod tests {
+    use super::words;
+
+    #[test]
+    fn places_are_cut() {
+        let text = "Cannot bind: [taken at /a/b-1.0/src/tcp.rs:61.] at /c/unicast.rs:338.";
+        assert_eq!(words(&text), "Cannot bind: [taken]");
+        assert_eq!(words(&"no place at all"), "no place at all");
+        assert_eq!(words(&"cut at /nothing"), "cut");
+    }
+}

@@ -2,6 +2,7 @@ use std::time::Duration;
 
 use zenoh::Wait;
 
+use super::error::words;
 use super::{Arrival, LiveToken, LiveWatch, NetError, Publisher, Server, SessionConfig, Stream, Subscriber};
 use super::{live, query};
 
@@ -21,7 +22,7 @@ impl Session {
         let zenoh = zenoh::open(config.zenoh()?).wait().map_err(|error| NetError::Open {
             listen: config.listen.clone(),
             connect: config.connect.clone(),
-            reason: error.to_string(),
+            reason: words(&error),
         })?;
         Ok(Self { zenoh })
     }
@@ -115,11 +116,11 @@ impl Session {
     /// # Errors
     /// [`NetError::Close`]
     pub fn close(&self) -> Result<(), NetError> {
-        self.zenoh.close().wait().map_err(|error| NetError::Close(error.to_string()))
+        self.zenoh.close().wait().map_err(|error| NetError::Close(words(&error)))
     }
 }
 
 /// The error of an `action` on `key`.
 pub(super) fn failed(action: &'static str, key: &str, reason: &impl ToString) -> NetError {
-    NetError::Key { action, key: key.to_owned(), reason: reason.to_string() }
+    NetError::Key { action, key: key.to_owned(), reason: words(reason) }
 }
