@@ -1,1 +1,24 @@
-//! The `operator` process as a library.
+//! The `operator` process: streams a human hand to a robot hand.
+//!
+//! | module | one line |
+//! |---|---|
+//! | [`source`] | where a hand comes from: gestures, recordings, other programs; pure in time |
+//! | [`hand`] | joint angles or keypoints to poses of the master hand |
+//! | [`pipeline`] | the source thread: frames in, poses out |
+//! | [`stream`] | the publisher thread behind a latest-value slot |
+//! | [`feedback`] | the robot as last heard, round trip, clock offset |
+//! | [`terminal`] | the status line |
+//! | [`watch`] | `operator watch` |
+//! | [`shutdown`] | ending in order |
+//! | [`cli`], [`app`] | the command line and the wiring |
+
+pub mod app;
+pub mod cli;
+pub mod feedback;
+pub mod hand;
+pub mod pipeline;
+pub mod shutdown;
+pub mod source;
+pub mod stream;
+pub mod terminal;
+pub mod watch;

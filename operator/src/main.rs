@@ -1,2 +1,16 @@
 //! Entry point of the `operator` process.
-fn main() {}
+
+use std::process::ExitCode;
+
+use clap::Parser as _;
+use teleop_operator::{app, cli::Cli};
+
+fn main() -> ExitCode {
+    match app::main(Cli::parse()) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(failure) => {
+            eprintln!("error: {failure:#}");
+            failure.exit_code()
+        }
+    }
+}

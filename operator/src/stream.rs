@@ -1,0 +1,126 @@
+//! The pose stream: a publisher thread behind a latest-value slot, so that a source never waits for the network.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::thread::JoinHandle;
+use std::time::Duration;
+
+use teleop_common::master::MasterPose;
+use teleop_common::net::clock::now;
+use teleop_common::net::{NetError, Publisher};
+use teleop_common::time::MonoTime;
+use teleop_common::wire::{PoseMessage, Stamper};
+
+use crate::feedback::Feedback;
+
+/// How often the publisher looks whether it should end.
+const LOOK: Duration = Duration::from_millis(100);
+
+/// A pose on its way to the network.
+#[derive(Clone, Copy, Debug)]
+pub struct Outgoing {
+    /// When the hand was in this pose.
+    pub captured: MonoTime,
+    /// The pose.
+    pub pose: MasterPose,
+}
+
+/// What the publisher has done so far. Shared with those who tell people about it.
+#[derive(Debug, Default)]
+pub struct StreamCounters {
+    /// Poses handed to the network.
+    pub sent: AtomicU64,
+    /// Poses that could not be sent.
+    pub failed: AtomicU64,
+    /// Send stamp of the newest pose, ns.
+    pub last_sent: AtomicU64,
+}
+
+/// The source's end: takes poses, never waits.
+pub struct PoseSender {
+    slot: triple_buffer::Input<Option<Outgoing>>,
+    publisher: std::thread::Thread,
+}
+
+/// The running publisher thread; dropping it ends it.
+pub struct PoseStream {
+    counters: Arc<StreamCounters>,
+    stop: Arc<AtomicBool>,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl PoseStream {
+    /// Starts publishing on `publisher` as the process `epoch`, with echoes from `feedback`.
+    ///
+    /// # Errors
+    /// The system refuses a thread.
+    pub fn start(publisher: Publisher, epoch: u64, feedback: Arc<Feedback>) -> std::io::Result<(Self, PoseSender)> {
+        let (slot, mut poses) = triple_buffer::triple_buffer(&None);
+        let (counters, stop) = (Arc::new(StreamCounters::default()), Arc::new(AtomicBool::new(false)));
+        let (count, stopped) = (Arc::clone(&counters), Arc::clone(&stop));
+        let thread = std::thread::Builder::new().name("publisher".to_owned()).spawn(move || {
+            let mut stamper = Stamper::new(epoch);
+            while !stopped.load(Ordering::Acquire) {
+                let news = if poses.update() { *poses.output_buffer() } else { None };
+                let Some(outgoing) = news else {
+                    std::thread::park_timeout(LOOK);
+                    continue;
+                };
+                match send(&publisher, &mut stamper, &feedback, &outgoing) {
+                    Ok(sent) => {
+                        count.sent.fetch_add(1, Ordering::Relaxed);
+                        count.last_sent.store(sent.0, Ordering::Release);
+                    }
+                    Err(error) => {
+                        // Told once: a stream that fails does so at every pose.
+                        if count.failed.fetch_add(1, Ordering::Relaxed) == 0 {
+                            tracing::error!("pose not sent: {error}");
+                        }
+                    }
+                }
+            }
+        })?;
+        let sender = PoseSender { slot, publisher: thread.thread().clone() };
+        Ok((Self { counters, stop, thread: Some(thread) }, sender))
+    }
+
+    /// What was sent so far.
+    #[must_use]
+    pub fn counters(&self) -> &StreamCounters {
+        &self.counters
+    }
+}
+
+impl Drop for PoseStream {
+    fn drop(&mut self) {
+        self.stop.store(true, Ordering::Release);
+        if let Some(thread) = self.thread.take() {
+            thread.thread().unpark();
+            if thread.join().is_err() {
+                tracing::error!("the publisher thread panicked");
+            }
+        }
+    }
+}
+
+impl PoseSender {
+    /// Sends `outgoing` as soon as the network takes it, unless a newer one comes first.
+    pub fn send(&mut self, outgoing: Outgoing) {
+        self.slot.write(Some(outgoing));
+        self.publisher.unpark();
+    }
+}
+
+fn send(
+    publisher: &Publisher,
+    stamper: &mut Stamper,
+    feedback: &Feedback,
+    outgoing: &Outgoing,
+) -> Result<MonoTime, NetError> {
+    let sent = now();
+    // Before the pose is on its way, or its echo could come back first.
+    feedback.on_sent(sent);
+    let header = stamper.header::<PoseMessage>(sent);
+    publisher.send(&PoseMessage::new(header, feedback.echo(sent), outgoing.captured, &outgoing.pose))?;
+    Ok(sent)
+}
