@@ -10,8 +10,8 @@
 //! position first, then closeness to the joint-mapped posture `q_ref`. It is approached by minimising
 //! `1/2 ||F(q) - p||^2 + 1/2 mu^2 ||q - q_ref||^2` for a falling series of mu, by a projected Newton method with
 //! Levenberg damping. The posture term keeps every system regular where the finger is singular (the Allegro's open
-//! hand has rank 1), and the damping bounds every step. At the smallest mu the position bias is below 1 um wherever
-//! the finger can move in the direction needed by more than a millimetre per radian.
+//! hand has rank 1), and the damping bounds every step. The smallest mu, 0.1 mm/rad, leaves a position bias of about
+//! `mu^2 ||q - q_ref|| / sigma`, 0.2 um for a radian at the usual sigma = 50 mm/rad.
 
 use nalgebra::{SMatrix, SVector, Vector3};
 
@@ -21,18 +21,21 @@ const N: usize = MAX_FINGER_JOINTS;
 type Vector = SVector<f64, N>;
 type Matrix = SMatrix<f64, N, N>;
 
-/// A target counts as reached within this distance, m.
-pub const REACHED: f64 = 1e-6;
+/// mu where the posture decides, m/rad: position and posture weigh alike for a finger of this size.
+pub const POSTURE_WEIGHT_MAX: f64 = 3e-3;
+/// mu where the position decides, m/rad. The position bias `mu^2 ||q - q_ref|| / sigma` is then below 0.01 um for a
+/// radian at the usual sigma = 50 mm/rad.
+pub const POSTURE_WEIGHT_MIN: f64 = 2e-5;
 
-// mu, m/rad. The first is where position and posture weigh alike for a finger of this size; the last decides the bias.
-const POSTURE_WEIGHTS: [f64; 3] = [3e-3, 3e-4, 2e-5];
+// Stages of falling mu in one descent.
+const STAGES: usize = 3;
 const ITERATIONS_PER_WEIGHT: u16 = 14;
 // Ways tried besides the one from the given start.
 const SEEDS: usize = 3;
 // A relative decrease of the weighted sum smaller than this ends a stage whose target is out of reach.
 const SETTLED: f64 = 1e-11;
 // A step smaller than this (rad) ends a stage.
-const STEP_TOLERANCE: [f64; 3] = [1e-3, 1e-4, 1e-9];
+const STEP_TOLERANCE: [f64; STAGES] = [1e-3, 1e-4, 1e-9];
 
 /// How a solve ended.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -40,7 +43,7 @@ pub enum IkStatus {
     /// Not solved: the joint-mapped posture was taken as it is.
     #[default]
     Skipped,
-    /// The target is reached, see [`REACHED`].
+    /// The target is reached, within 1 um or a twentieth of the posture weight times a radian.
     Reached,
     /// The target is out of reach; the nearest point found is returned.
     Unreachable,
@@ -65,16 +68,20 @@ pub struct FingerIk {
     lower: Vector,
     upper: Vector,
     count: usize,
+    // Postures on a grid over the joint box, with their tips: where to begin when the warm start leads nowhere.
+    samples: Vec<(Vector, Vector3<f64>)>,
 }
 
 struct Descent {
     q: Vector,
+    cost: f64,
     iterations: u16,
     converged: bool,
 }
 
 impl FingerIk {
-    /// A solver for `chain`, with the limits of the hand's `joints` (wire order).
+    /// A solver for `chain`, with the limits of the hand's `joints` (wire order). Allocates; [`FingerIk::solve`] does
+    /// not.
     #[must_use]
     pub fn new(chain: &FingerChain, joints: &[Joint]) -> Self {
         let (mut lower, mut upper) = (Vector::zeros(), Vector::zeros());
@@ -82,17 +89,36 @@ impl FingerIk {
             lower[slot] = joints[joint.joint].lower;
             upper[slot] = joints[joint.joint].upper;
         }
-        Self { lower, upper, count: chain.joints.len() }
+        let count = chain.joints.len();
+        // The finest grid of at most a thousand or so postures.
+        let per_joint = [1, 1000, 33, 10, 6, 4][count.min(N)];
+        let total = (0..count).fold(1_usize, |total, _| total * per_joint);
+        let samples = (0..total).map(|index| {
+            let mut rest = index;
+            let mut q = Vector::zeros();
+            for slot in 0..count {
+                let share = (rest % per_joint) as f64 / (per_joint - 1) as f64;
+                q[slot] = lower[slot] + (upper[slot] - lower[slot]) * share;
+                rest /= per_joint;
+            }
+            (q, chain.tip(&q.as_slice()[..count], TipFrame::Pole))
+        });
+        Self { lower, upper, count, samples: samples.collect() }
     }
 
     /// Most iterations one [`FingerIk::solve`] can take.
-    pub const MAX_ITERATIONS: u16 = (1 + SEEDS as u16) * ITERATIONS_PER_WEIGHT * POSTURE_WEIGHTS.len() as u16;
+    pub const MAX_ITERATIONS: u16 = (1 + SEEDS as u16) * ITERATIONS_PER_WEIGHT * STAGES as u16;
 
     /// Joint angles (rad, palm outwards) that bring the pole of `chain` to `target` (m, palm frame), as close to
     /// `reference` as the target allows; `start` is where to begin, best the last solution.
     ///
+    /// `posture_weight` is the final mu (m/rad), between [`POSTURE_WEIGHT_MIN`] and [`POSTURE_WEIGHT_MAX`]: the
+    /// exchange rate of "position first". With a tiny one a target a few micrometres out of reach throws a joint
+    /// across its range wherever the finger is singular.
+    ///
     /// Does not allocate; at most [`FingerIk::MAX_ITERATIONS`] iterations. If the way from `start` does not reach the
-    /// target, the ways from `reference` and from a few fixed postures are tried too and the best end returned.
+    /// target, the ways from `reference` and from two sampled postures are tried too and the best end returned. The
+    /// result is a local optimum of the posture and, for all but rare targets, the global one of the position.
     #[must_use]
     pub fn solve(
         &self,
@@ -100,23 +126,27 @@ impl FingerIk {
         target: &Vector3<f64>,
         reference: &[f64; N],
         start: &[f64; N],
+        posture_weight: f64,
     ) -> ([f64; N], IkReport) {
+        let mu = posture_weight.clamp(POSTURE_WEIGHT_MIN, POSTURE_WEIGHT_MAX);
+        let tolerance = 0.05 * mu;
         let reference = Vector::from(*reference);
-        let mut best = self.descend(chain, target, &reference, &Vector::from(*start));
+        let mut best = self.descend(chain, target, &reference, &Vector::from(*start), mu);
         let mut residual = self.residual(chain, target, &best.q);
         let mut iterations = best.iterations;
         for seed in 0..SEEDS {
-            if residual <= REACHED {
+            if residual <= tolerance {
                 break;
             }
-            let other = self.descend(chain, target, &reference, &self.seed(seed, &reference));
+            let other = self.descend(chain, target, &reference, &self.seed(seed, target, &reference), mu);
             let other_residual = self.residual(chain, target, &other.q);
             iterations += other.iterations;
-            if other_residual < residual - REACHED {
+            // Ends within rounding of each other are one end: stay on the way of the last solution.
+            if other.cost < best.cost * (1.0 - 1e-6) {
                 (best, residual) = (other, other_residual);
             }
         }
-        let status = if residual <= REACHED {
+        let status = if residual <= tolerance {
             IkStatus::Reached
         } else if best.converged {
             IkStatus::Unreachable
@@ -126,13 +156,22 @@ impl FingerIk {
         (best.q.into(), IkReport { status, iterations, residual })
     }
 
-    /// Where to begin anew: the reference, then half and fully curled postures.
-    fn seed(&self, seed: usize, reference: &Vector) -> Vector {
-        match seed {
-            0 => *reference,
-            1 => (self.lower + self.upper) * 0.5,
-            _ => self.lower * 0.2 + self.upper * 0.8,
+    /// Where to begin anew: the reference, the sampled posture with the nearest tip, and the one that is nearest in
+    /// tip and posture together.
+    fn seed(&self, seed: usize, target: &Vector3<f64>, reference: &Vector) -> Vector {
+        let weight = match seed {
+            0 => return *reference,
+            1 => 0.0,
+            _ => POSTURE_WEIGHT_MAX * POSTURE_WEIGHT_MAX,
+        };
+        let mut best = (f64::INFINITY, *reference);
+        for (q, tip) in &self.samples {
+            let cost = (tip - target).norm_squared() + weight * (q - reference).norm_squared();
+            if cost < best.0 {
+                best = (cost, *q);
+            }
         }
+        best.1
     }
 
     fn residual(&self, chain: &FingerChain, target: &Vector3<f64>, q: &Vector) -> f64 {
@@ -143,11 +182,19 @@ impl FingerIk {
         q.zip_zip_map(&self.lower, &self.upper, |value, lower, upper| value.max(lower).min(upper))
     }
 
-    fn descend(&self, chain: &FingerChain, target: &Vector3<f64>, reference: &Vector, start: &Vector) -> Descent {
-        let mut out = Descent { q: self.clip(start), iterations: 0, converged: false };
-        for (mu, tolerance) in POSTURE_WEIGHTS.into_iter().zip(STEP_TOLERANCE) {
-            let (q, iterations, converged) = self.stage(chain, target, reference, out.q, mu, tolerance);
-            out = Descent { q, iterations: out.iterations + iterations, converged };
+    fn descend(
+        &self,
+        chain: &FingerChain,
+        target: &Vector3<f64>,
+        reference: &Vector,
+        start: &Vector,
+        mu: f64,
+    ) -> Descent {
+        let mut out = Descent { q: self.clip(start), cost: f64::INFINITY, iterations: 0, converged: false };
+        let weights = [POSTURE_WEIGHT_MAX, (POSTURE_WEIGHT_MAX * mu).sqrt(), mu];
+        for (mu, tolerance) in weights.into_iter().zip(STEP_TOLERANCE) {
+            let stage = self.stage(chain, target, reference, out.q, mu, tolerance);
+            out = Descent { iterations: out.iterations + stage.iterations, ..stage };
         }
         out
     }
@@ -161,7 +208,7 @@ impl FingerIk {
         mut q: Vector,
         mu: f64,
         tolerance: f64,
-    ) -> (Vector, u16, bool) {
+    ) -> Descent {
         let weight = mu * mu;
         let cost = |residual: &Vector3<f64>, q: &Vector| {
             0.5 * residual.norm_squared() + 0.5 * weight * (q - reference).norm_squared()
@@ -173,14 +220,14 @@ impl FingerIk {
         for iteration in 0..ITERATIONS_PER_WEIGHT {
             let (gradient, hessian) = self.derivatives(&state.1, &state.2, &residual, &q, reference, weight);
             let Some(step) = self.step(&q, &gradient, hessian, &mut damping) else {
-                return (q, iteration, true);
+                return Descent { q, cost: value, iterations: iteration, converged: true };
             };
             let trial = self.clip(&(q + step));
             let moved = (trial - q).amax();
             if moved < tolerance {
                 // The damping may have shortened the step: only an undamped one says that this is the minimum.
                 if damping <= 1e-6 {
-                    return (trial, iteration + 1, true);
+                    return Descent { q: trial, cost: value, iterations: iteration + 1, converged: true };
                 }
                 damping = 0.0;
                 continue;
@@ -195,18 +242,18 @@ impl FingerIk {
                 if damping < 1e-8 {
                     damping = 0.0;
                 }
-                if settled && residual.norm_squared() > REACHED * REACHED {
+                if settled && residual.norm_squared() > mu * mu {
                     // Out of reach and nothing left to gain.
-                    return (q, iteration + 1, true);
+                    return Descent { q, cost: value, iterations: iteration + 1, converged: true };
                 }
             } else if moved < 1e-7 {
                 // Down to rounding: no decrease is left to find.
-                return (q, iteration + 1, true);
+                return Descent { q, cost: value, iterations: iteration + 1, converged: true };
             } else {
                 damping = (damping * 8.0).max(1e-5);
             }
         }
-        (q, ITERATIONS_PER_WEIGHT, false)
+        Descent { q, cost: value, iterations: ITERATIONS_PER_WEIGHT, converged: false }
     }
 
     /// Gradient and Hessian of the weighted sum; the Hessian with the curvature of the chain (exact), because for a

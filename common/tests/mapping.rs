@@ -130,10 +130,7 @@ fn taps_of_the_default_preset_close_and_leave_the_other_fingers_alone() {
 /// The tripod over 80 s at 10 Hz, as in the paper's Fig. 8.
 fn fig8(params: MappingParams, gesture: Gesture) -> Vec<(f64, MappingOutput)> {
     let mut retargeter = retargeter(params);
-    (0..800)
-        .map(|tick| f64::from(tick) * 0.1)
-        .map(|t| (t, retargeter.map(&pose(gesture.sample(t)))))
-        .collect()
+    (0..800).map(|tick| f64::from(tick) * 0.1).map(|t| (t, retargeter.map(&pose(gesture.sample(t))))).collect()
 }
 
 #[test]
@@ -180,7 +177,9 @@ fn fig8_has_the_properties_of_a_joint_a_transition_and_a_cartesian_phase() {
                     let bound = (after.p_joint - before.p_joint).norm()
                         + (after.p_cartesian - before.p_cartesian).norm()
                         + std::f64::consts::PI
-                            * (after.p_cartesian - after.p_joint).norm().max((before.p_cartesian - before.p_joint).norm())
+                            * (after.p_cartesian - after.p_joint)
+                                .norm()
+                                .max((before.p_cartesian - before.p_joint).norm())
                             * (after.delta - before.delta).abs()
                             / (2.0 * (params.r2 - params.r1));
                     assert!((after.p_input - before.p_input).norm() <= bound + 1e-12, "{:?}", after.finger);
@@ -237,8 +236,7 @@ fn fig8_runs_on_the_papers_clock() {
 #[test]
 fn both_hands_do_the_same() {
     let mut right = retargeter(MappingParams::default());
-    let mut left =
-        Retargeter::new(HandModel::allegro_v4(HandSide::Left), MappingParams::default()).unwrap();
+    let mut left = Retargeter::new(HandModel::allegro_v4(HandSide::Left), MappingParams::default()).unwrap();
     for tick in 0..2000 {
         let pose = pose(Gesture::Tour.sample(f64::from(tick) * 0.02));
         let (right, left) = (right.map(&pose), left.map(&pose));

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
-use teleop_common::hand::{HandError, HandModel, HandSide};
+use teleop_common::hand::{HandError, HandModel, HandSide, allegro_v4_texts};
 use teleop_common::mapping::{MappingMode, MappingParams, ParamError};
 
 use crate::control::{ControlParams, GateParams};
@@ -222,7 +222,7 @@ impl HandSource {
         let mut hand = if self.urdf.is_none() && self.description.is_none() {
             HandModel::allegro_v4(self.side)
         } else {
-            let (urdf, description) = HandModel::allegro_v4_texts(self.side);
+            let (urdf, description) = allegro_v4_texts(self.side);
             let urdf_text = self.urdf.as_ref().map_or_else(|| Ok(urdf.to_owned()), read)?;
             let text = self.description.as_ref().map_or_else(|| Ok(description.to_owned()), read)?;
             HandModel::load(&urdf_text, &text).map_err(|source| ConfigError::Hand { origin: self.origin(), source })?
