@@ -13,6 +13,7 @@
 //! | [`mode`] | what the robot is doing |
 //! | [`key`] | key expressions of a robot |
 //! | [`wire`] | the binary messages and their one codec door |
+//! | [`recording`] | recordings of a human hand, line by line: CSV of keypoints, JSON lines |
 //! | [`time`] | monotonic time as a number, clock offset, latency histogram |
 //! | [`testing`] | where tests find recordings |
 
@@ -24,6 +25,7 @@ pub mod master;
 pub mod mode;
 #[cfg(feature = "net")]
 pub mod net;
+pub mod recording;
 pub mod testing;
 pub mod time;
 #[cfg(feature = "viz")]

@@ -91,6 +91,7 @@ fn fig8_time_line() {
 }
 
 #[test]
+#[allow(clippy::needless_range_loop, reason = "joints index four arrays")]
 fn every_gesture_loops_smoothly_inside_the_limits() {
     const H: f64 = 1e-3;
     for gesture in Gesture::ALL {

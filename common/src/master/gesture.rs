@@ -257,8 +257,9 @@ impl Gesture {
             let u = (rest / segment.r#move).min(1.0);
             for (finger, [start, end]) in segment.window.into_iter().enumerate() {
                 let s = minimum_jerk((u - start) / (end - start));
-                for joint in finger * 4..finger * 4 + 4 {
-                    q[joint] += s * (segment.to[joint] - q[joint]);
+                let joints = finger * 4..finger * 4 + 4;
+                for (angle, to) in q[joints.clone()].iter_mut().zip(&segment.to[joints]) {
+                    *angle += s * (to - *angle);
                 }
             }
             rest -= segment.r#move + segment.rest;

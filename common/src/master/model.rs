@@ -224,8 +224,8 @@ impl MasterGeometry {
     pub fn validate(&self) -> Result<(), MasterError> {
         for finger in Finger::ALL {
             let position = self.bases[finger.index()];
-            // Negated, so that NaN fails too.
-            if !(Vector3::from(position).norm() <= MAX_BASE) {
+            // A range, so that NaN fails too.
+            if !(0.0..=MAX_BASE).contains(&Vector3::from(position).norm()) {
                 return Err(MasterError::Base { finger, position });
             }
             for (phalanx, &value) in self.phalanges[finger.index()].iter().enumerate() {

@@ -1,0 +1,85 @@
+//! Time of one fit of a whole hand: synthetic keypoints of the gesture tour with tracker noise, and the same
+//! without a last posture. `cargo bench -p teleop-common --bench fit`.
+#![allow(clippy::print_stdout, clippy::unwrap_used, reason = "a bench reports on the terminal")]
+
+use std::hint::black_box;
+use std::time::Instant;
+
+use nalgebra::Vector3;
+use teleop_common::hand::{Finger, HandSide};
+use teleop_common::master::{Fitter, Gesture, Keypoints, MasterGeometry};
+
+/// Standard deviation of the noise, m.
+const NOISE: f64 = 3e-3;
+const FRAMES: usize = 20_000;
+
+fn main() {
+    let frames: Vec<Keypoints> = frames();
+    let geometry = MasterGeometry::PARADIGMATIC;
+    let mut fitter = Fitter::new(geometry, HandSide::Right);
+    report("fit, warm", &frames, |frame| {
+        black_box(fitter.fit(frame));
+    });
+    report("fit, cold", &frames, |frame| {
+        let mut fitter = Fitter::new(geometry, HandSide::Right);
+        black_box(fitter.fit(frame));
+    });
+}
+
+fn report(name: &str, frames: &[Keypoints], mut run: impl FnMut(&Keypoints)) {
+    for frame in frames.iter().take(1000) {
+        run(black_box(frame));
+    }
+    let start = Instant::now();
+    let mut times: Vec<u64> = frames
+        .iter()
+        .map(|frame| {
+            let start = Instant::now();
+            run(black_box(frame));
+            u64::try_from(start.elapsed().as_nanos()).unwrap_or(u64::MAX)
+        })
+        .collect();
+    let total = start.elapsed().as_secs_f64();
+    times.sort_unstable();
+    let us = |index: usize| times[index.min(times.len() - 1)] as f64 * 1e-3;
+    let (p50, p99, max) = (us(times.len() / 2), us(times.len() * 99 / 100), us(times.len()));
+    let rate = times.len() as f64 / total;
+    println!("{name:12} p50 {p50:7.2} us  p99 {p99:7.2} us  max {max:7.2} us  {rate:9.0} hands/s");
+}
+
+fn frames() -> Vec<Keypoints> {
+    let geometry = MasterGeometry::PARADIGMATIC;
+    let tour = Gesture::Tour;
+    let mut noise = Noise(1);
+    (0..FRAMES)
+        .filter_map(|i| {
+            let q = tour.sample(tour.duration() * i as f64 / FRAMES as f64);
+            let mut points = [[0.0; 3]; 21];
+            for finger in Finger::ALL {
+                let f = finger.index();
+                let angles = [q[4 * f], q[4 * f + 1], q[4 * f + 2], q[4 * f + 3]];
+                for (k, point) in geometry.finger_points(finger, &angles).into_iter().enumerate() {
+                    points[1 + 4 * f + k] = (point + noise.vector() * NOISE).into();
+                }
+            }
+            Keypoints::new(points).ok()
+        })
+        .collect()
+}
+
+/// Normal numbers from a splitmix64 generator: the same on every run.
+struct Noise(u64);
+
+impl Noise {
+    fn uniform(&mut self) -> f64 {
+        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
+        let mut z = self.0;
+        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
+        ((z ^ (z >> 31)) >> 11) as f64 / (1u64 << 53) as f64
+    }
+
+    fn vector(&mut self) -> Vector3<f64> {
+        Vector3::from_fn(|_, _| (0..12).map(|_| self.uniform()).sum::<f64>() - 6.0)
+    }
+}
