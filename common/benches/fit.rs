@@ -1,13 +1,17 @@
 //! Time of one fit of a whole hand: synthetic keypoints of the gesture tour with tracker noise, and the same
-//! without a last posture. `cargo bench -p teleop-common --bench fit`.
+//! without a last posture; then the real recording, where it is at hand. `cargo bench -p teleop-common --bench fit`.
 #![allow(clippy::print_stdout, clippy::unwrap_used, reason = "a bench reports on the terminal")]
 
+use std::fs::File;
 use std::hint::black_box;
+use std::io::BufReader;
 use std::time::Instant;
 
 use nalgebra::Vector3;
 use teleop_common::hand::{Finger, HandSide};
-use teleop_common::master::{Fitter, Gesture, Keypoints, MasterGeometry};
+use teleop_common::master::{Calibrator, Fitter, Gesture, Keypoints, MasterGeometry};
+use teleop_common::recording::{FrameData, LastLine, RecordingReader};
+use teleop_common::testing::shared_data;
 
 /// Standard deviation of the noise, m.
 const NOISE: f64 = 3e-3;
@@ -22,6 +26,22 @@ fn main() {
     });
     report("fit, cold", &frames, |frame| {
         let mut fitter = Fitter::new(geometry, HandSide::Right);
+        black_box(fitter.fit(frame));
+    });
+    let Some(path) = shared_data("human_hand_right.csv") else { return };
+    let reader = RecordingReader::new(BufReader::new(File::open(path).unwrap()), LastLine::Whole).unwrap();
+    let frames: Vec<Keypoints> = reader
+        .filter_map(|frame| match frame.unwrap().data {
+            FrameData::Keypoints(keypoints) => Some(keypoints),
+            FrameData::Joints(_) => None,
+        })
+        .collect();
+    let mut calibrator = Calibrator::default();
+    frames.iter().for_each(|frame| calibrator.push(frame));
+    let calibration = calibrator.finish().unwrap();
+    let mut fitter = Fitter::new(calibration.geometry, calibration.side);
+    let repeated: Vec<Keypoints> = frames.iter().copied().cycle().take(FRAMES).collect();
+    report("recording", &repeated, |frame| {
         black_box(fitter.fit(frame));
     });
 }
