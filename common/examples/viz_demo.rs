@@ -23,8 +23,11 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let (r1, r2) = (params.r1, params.r2);
     let mut retargeter = Retargeter::new(hand.clone(), params)?;
     let robot = Viz::start(viewer.clone(), Scene::robot("demo", &hand))?;
-    // A file holds one side's stream; a hub takes both.
-    let second = if matches!(viewer, Viewer::Save(_)) { Viewer::Off } else { viewer };
+    // A file takes one stream; a hub takes both.
+    let second = match viewer {
+        Viewer::Save(path) => Viewer::Save(path.with_extension("operator.rrd")),
+        viewer => viewer,
+    };
     let operator = Viz::start(second, Scene::operator("demo", side))?;
     let (log_robot, log_operator) = (robot.logger(), operator.logger());
 

@@ -8,11 +8,12 @@ use rerun::blueprint::components::{
     QueryExpression, RootContainer, RowShare, ViewClass, VisibleTimeRange,
 };
 use rerun::datatypes::{self, TimeInt, TimeRange, TimeRangeBoundary, Uuid};
-use rerun::external::re_log_types::BlueprintActivationCommand;
+use rerun::external::re_log_types::{BlueprintActivationCommand, LogMsg};
 use rerun::external::re_sdk_types::blueprint::archetypes::{
     Background, ContainerBlueprint, EyeControls3D, LineGrid3D, PanelBlueprint, PlotLegend, ScalarAxis, TimeAxis,
     TimePanelBlueprint, ViewBlueprint, ViewContents, ViewportBlueprint, VisibleTimeRanges,
 };
+use rerun::sink::LogSink;
 use rerun::{AsComponents, RecordingStream, RecordingStreamBuilder, RecordingStreamResult, SerializedComponentBatch};
 
 use super::{APPLICATION, TIMELINE, palette};
@@ -20,32 +21,38 @@ use super::{APPLICATION, TIMELINE, palette};
 /// What the plots show, ns.
 const WINDOW: i64 = 20_000_000_000;
 
-/// Sends the blueprint into `stream`. A person's own layout stays: this becomes the default, and active only where
-/// nothing else is.
-pub(super) fn send(stream: &RecordingStream) -> RecordingStreamResult<()> {
-    let (blueprint, storage) =
+/// Sends the blueprint into `sink`, ahead of the recording: a viewer that sees the recording first makes up a layout of
+/// its own and stays with it. A layout that a person has arranged stays too: this one becomes the default, and active
+/// only where there is no other.
+pub(super) fn send(sink: &dyn LogSink) -> RecordingStreamResult<()> {
+    let messages = messages()?;
+    if let Some(id) = messages.first().map(|message| message.store_id().clone()) {
+        sink.send_blueprint(messages, BlueprintActivationCommand::make_default(id));
+    }
+    Ok(())
+}
+
+fn messages() -> RecordingStreamResult<Vec<LogMsg>> {
+    let (stream, storage) =
         RecordingStreamBuilder::new(APPLICATION).recording_id("layout").blueprint().enabled(true).memory()?;
-    blueprint.set_time_sequence("blueprint", 0);
+    stream.set_log_time_enabled(false);
+    stream.set_time_sequence("blueprint", 0);
     let mut ids = 0;
-    let root = write(&layout(), &mut ids, &blueprint)?;
+    let root = write(&layout(), &mut ids, &stream)?;
     let viewport = ViewportBlueprint::new()
         .with_root_container(RootContainer(Uuid { bytes: uuid_bytes(root.id) }))
         .with_auto_layout(false)
         .with_auto_views(false);
-    blueprint.log("viewport", &viewport)?;
+    stream.log("viewport", &viewport)?;
     let collapsed = PanelBlueprint::new().with_state(PanelState::Collapsed);
-    blueprint.log("blueprint_panel", &collapsed)?;
-    blueprint.log("selection_panel", &collapsed)?;
+    stream.log("blueprint_panel", &collapsed)?;
+    stream.log("selection_panel", &collapsed)?;
     let time = TimePanelBlueprint::new()
         .with_state(PanelState::Collapsed)
         .with_timeline(TIMELINE)
         .with_play_state(PlayState::Following);
-    blueprint.log("time_panel", &time)?;
-    let messages = storage.take();
-    if let Some(id) = messages.first().map(|message| message.store_id().clone()) {
-        stream.send_blueprint(messages, BlueprintActivationCommand::make_default(id));
-    }
-    Ok(())
+    stream.log("time_panel", &time)?;
+    Ok(storage.take())
 }
 
 fn layout() -> Node {

@@ -13,8 +13,8 @@ pub const PAGE_PORT: u16 = 9090;
 pub const GRPC_PORT: u16 = 9876;
 /// How many page ports are tried when the first is taken.
 const PAGE_PORTS: u16 = 10;
-/// History that the hub keeps for browsers that open the page later; when it is full, the oldest goes.
-const HISTORY: u64 = 128 << 20;
+/// History that the hub keeps for browsers that open the page later: about a minute; when it is full, the oldest goes.
+const HISTORY: u64 = 16 << 20;
 /// How long a server on this machine may take to come up.
 const START: Duration = Duration::from_secs(2);
 /// How long a viewer may take to accept a connection.
@@ -180,7 +180,9 @@ fn server_options(options: &HubOptions) -> ServerOptions {
     let cors = if options.bind.is_loopback() { Vec::new() } else { vec!["http://*".to_owned()] };
     ServerOptions {
         memory_limit: MemoryLimit::from_bytes(HISTORY),
-        playback_behavior: PlaybackBehavior::NewestFirst,
+        // Newest first would let live data overtake the layout and all that is static, for as long as a slow browser
+        // cannot keep up with it.
+        playback_behavior: PlaybackBehavior::OldestFirst,
         cors_allowed_origins: cors,
     }
 }

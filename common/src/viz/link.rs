@@ -6,7 +6,6 @@
 //! be), and starts the next one with a new stream, which sends the layout and everything static again.
 
 use std::net::{SocketAddr, ToSocketAddrs};
-use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU8, Ordering};
 use std::sync::mpsc::{self, RecvTimeoutError};
@@ -23,7 +22,7 @@ use super::queue::Feed;
 use super::scene::{Scene, Writer};
 use super::status::{Shared, Status};
 use super::viewer::ViewerUrl;
-use super::{APPLICATION, Viewer, VizError};
+use super::{APPLICATION, Viewer, VizError, blueprint};
 
 /// How often the supervisor looks.
 const LOOK: Duration = Duration::from_secs(1);
@@ -33,6 +32,9 @@ const PATIENCE: u32 = 3;
 const CONNECT: Duration = Duration::from_secs(5);
 /// How often the writer drains the queue.
 const DRAIN: Duration = Duration::from_millis(10);
+/// How long data may wait to be sent together, to a viewer and to a file.
+const LIVE_FLUSH: Duration = Duration::from_millis(30);
+const FILE_FLUSH: Duration = Duration::from_millis(500);
 
 /// A session's threads.
 #[derive(Debug)]
@@ -47,8 +49,11 @@ impl Handle {
         let (stop, stopped) = mpsc::channel();
         let job: Box<dyn FnOnce() -> bool + Send> = match viewer {
             Viewer::Save(path) => {
-                let stream = file(&path, &scene).map_err(|reason| VizError::Save { path: path.clone(), reason })?;
-                let link = Link::start(stream, scene, feed, None)?;
+                // The footer's index would grow in memory for as long as the run lasts.
+                let options = FileSinkOptions { write_footer: false };
+                let sink = FileSink::with_options(&path, options)
+                    .map_err(|error| VizError::Save { path: path.clone(), reason: error.to_string() })?;
+                let link = Link::start(Box::new(sink), scene, feed, None)?;
                 status.set(Status::Saving(path));
                 Box::new(move || {
                     let limit = stopped.recv().unwrap_or_default();
@@ -185,10 +190,9 @@ impl Supervisor {
     }
 
     fn open(&self, url: &ViewerUrl) -> Result<Link, String> {
-        let sink = Arc::new(GrpcSink::new(url.uri()));
-        let stream = builder(&self.scene).buffered().map_err(|error| error.to_string())?;
-        stream.set_sink(Box::new(Watched(Arc::clone(&sink))));
-        Link::start(stream, Arc::clone(&self.scene), Arc::clone(&self.feed), Some(sink)).map_err(|e| e.to_string())
+        let client = Arc::new(GrpcSink::new(url.uri()));
+        let sink = Box::new(Watched(Arc::clone(&client)));
+        Link::start(sink, Arc::clone(&self.scene), Arc::clone(&self.feed), Some(client)).map_err(|e| e.to_string())
     }
 }
 
@@ -197,22 +201,21 @@ fn first_answering(url: &ViewerUrl) -> bool {
     addresses.into_iter().take(4).any(answers)
 }
 
-fn builder(scene: &Scene) -> RecordingStreamBuilder {
-    RecordingStreamBuilder::new(APPLICATION).recording_id(scene.recording()).enabled(true).batcher_config(
-        ChunkBatcherConfig {
-            flush_tick: Duration::from_millis(20),
-            max_bytes_in_flight: 8 << 20,
-            ..ChunkBatcherConfig::DEFAULT
-        },
-    )
-}
-
-fn file(path: &Path, scene: &Scene) -> Result<RecordingStream, String> {
-    // The footer's index would grow in memory for as long as the run lasts.
-    let sink = FileSink::with_options(path, FileSinkOptions { write_footer: false }).map_err(|e| e.to_string())?;
-    let config = ChunkBatcherConfig { max_bytes_in_flight: 8 << 20, ..ChunkBatcherConfig::DEFAULT };
-    let stream = builder(scene).batcher_config(config).buffered().map_err(|error| error.to_string())?;
-    stream.set_sink(Box::new(sink));
+/// A stream for `scene` into `sink`, the layout first.
+fn open_stream(scene: &Scene, sink: Box<dyn LogSink>) -> RecordingStreamResult<RecordingStream> {
+    blueprint::send(sink.as_ref())?;
+    let batching = ChunkBatcherConfig {
+        // Live: as often as the 3D views move. In a file, larger chunks are smaller on the whole.
+        flush_tick: if sink.defers_finalization_to_shutdown() { FILE_FLUSH } else { LIVE_FLUSH },
+        max_bytes_in_flight: 8 << 20,
+        ..ChunkBatcherConfig::DEFAULT
+    };
+    let stream = RecordingStreamBuilder::new(APPLICATION)
+        .recording_id(scene.recording())
+        .enabled(true)
+        .batcher_config(batching)
+        .buffered()?;
+    stream.set_sink(sink);
     Ok(stream)
 }
 
@@ -243,7 +246,7 @@ enum State {
 
 /// One stream and the thread that writes it.
 struct Link {
-    sink: Option<Arc<GrpcSink>>,
+    client: Option<Arc<GrpcSink>>,
     order: Arc<AtomicU8>,
     since: Instant,
     was_open: AtomicBool,
@@ -261,25 +264,30 @@ mod order {
 
 impl Link {
     fn start(
-        stream: RecordingStream,
+        sink: Box<dyn LogSink>,
         scene: Arc<Scene>,
         feed: Arc<Feed>,
-        sink: Option<Arc<GrpcSink>>,
+        client: Option<Arc<GrpcSink>>,
     ) -> Result<Self, std::io::Error> {
         let order = Arc::new(AtomicU8::new(order::WRITE));
         let theirs = Arc::clone(&order);
         let writer = thread::Builder::new().name("viewer-writer".to_owned()).spawn(move || {
-            if let Err(error) = write(&stream, &scene, &feed, &theirs) {
+            let written = open_stream(&scene, sink).and_then(|stream| {
+                let result = write(&stream, &scene, &feed, &theirs);
+                // Waits for the data to go out, for ever if need be: nobody waits for this thread.
+                drop(stream);
+                result
+            });
+            if let Err(error) = written {
                 tracing::warn!(target: "viewer", "{error}");
             }
-            // Dropping the stream waits for its data to go out: here nobody waits for us.
         })?;
-        Ok(Self { sink, order, since: Instant::now(), was_open: AtomicBool::new(false), writer })
+        Ok(Self { client, order, since: Instant::now(), was_open: AtomicBool::new(false), writer })
     }
 
     fn state(&self) -> State {
         let was_open = self.was_open.load(Ordering::Relaxed);
-        match self.sink.as_ref().map(|sink| sink.status()) {
+        match self.client.as_ref().map(|client| client.status()) {
             _ if self.writer.is_finished() => State::Closed,
             None => State::Open,
             Some(GrpcSinkConnectionState::Connected) => {

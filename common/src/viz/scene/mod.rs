@@ -7,12 +7,12 @@ mod space;
 
 use rerun::{RecordingStream, RecordingStreamResult, StateChange, TextLog};
 
+use super::TIMELINE;
 use super::frame::{Frame, Line};
-use super::{TIMELINE, blueprint};
 use crate::hand::{Finger, HandModel, HandSide};
 
-/// 3D: smooth for the eye, and a third of the bytes of the control rate.
-const SPACE_PERIOD: i64 = 1_000_000_000 / 30;
+/// 3D: smooth enough for the eye; more only keeps browsers without a graphics card from following.
+const SPACE_PERIOD: i64 = 1_000_000_000 / 25;
 /// Plots.
 const PLOT_PERIOD: i64 = 1_000_000_000 / 50;
 
@@ -79,10 +79,9 @@ enum Drawing<'a> {
 }
 
 impl<'a> Writer<'a> {
-    /// Sends the layout and all that does not change.
+    /// Sends all that does not change.
     pub(super) fn new(scene: &'a Scene, stream: &'a RecordingStream) -> RecordingStreamResult<Self> {
         stream.set_log_time_enabled(false);
-        blueprint::send(stream)?;
         let drawing = match scene {
             Scene::Operator { side, opposing, .. } => {
                 Drawing::Operator(operator::Drawing::new(*side, opposing, stream)?)
@@ -128,7 +127,7 @@ impl Pace {
     }
 
     fn due(&mut self, time: i64) -> bool {
-        // Half a control period of slack, or 333 Hz would give 27.8 Hz for 30.
+        // Half a control period of slack, or 100 Hz would give 20 Hz for 25 whenever a frame comes early.
         const SLACK: i64 = 1_500_000;
         let due = self.last.is_none_or(|last| {
             let elapsed = time.saturating_sub(last);
@@ -169,7 +168,7 @@ mod tests {
     fn pace_thins_out_and_survives_a_clock_that_jumps_back() {
         let mut pace = Pace::new(SPACE_PERIOD);
         let passed = (0..3330).filter(|tick| pace.due(tick * 3_003_003)).count();
-        assert!((270..=330).contains(&passed), "{passed} in 10 s");
+        assert!((240..=270).contains(&passed), "{passed} in 10 s");
         assert!(pace.due(0));
         assert!(!pace.due(1));
     }

@@ -1,4 +1,4 @@
-use nalgebra::{UnitQuaternion, Vector3};
+use nalgebra::Vector3;
 use rerun::{Capsules3D, Ellipsoids3D, FillMode, LineStrips3D, RecordingStream, RecordingStreamResult};
 
 use super::series::{Curve, Series};
@@ -153,24 +153,14 @@ impl<'a> Drawing<'a> {
         let radii = [frame.r1, frame.r2];
         if self.radii != Some(radii) {
             self.radii = Some(radii);
-            let inner = Ellipsoids3D::from_radii([frame.r1 as f32])
-                .with_colors([palette::rgba(255, 226, 60, 60)])
-                .with_line_radii([0.0003])
-                .with_fill_mode(FillMode::TransparentFillMajorWireframe);
-            stream.log_static("operator/hand/r1", &inner)?;
-            let outer = Ellipsoids3D::from_radii([frame.r2 as f32])
-                .with_colors([palette::rgba(170, 175, 190, 90)])
-                .with_line_radii([0.00015])
+            let spheres = Ellipsoids3D::from_radii(radii.map(|radius| radius as f32))
+                .with_colors([palette::BLEND, palette::FAINT])
+                .with_line_radii([0.0003, 0.0002])
                 .with_fill_mode(FillMode::MajorWireframe);
-            stream.log_static("operator/hand/r2", &outer)?;
+            stream.log_static("operator/hand/spheres", &spheres)?;
         }
         let tip = point(&from_master(&frame.pose.tip(Finger::Thumb), self.side));
-        let turn = quaternion(&UnitQuaternion::identity());
-        for path in ["operator/hand/r1", "operator/hand/r2"] {
-            let moved = Ellipsoids3D::update_fields().with_centers([tip]).with_quaternions([turn]);
-            stream.log(path, &moved)?;
-        }
-        Ok(())
+        stream.log("operator/hand/spheres", &Ellipsoids3D::update_fields().with_centers([tip, tip]))
     }
 
     /// Lines from the thumb tip to the fingertips inside r2, in the finger's colour by k.

@@ -203,16 +203,15 @@ impl<'a> Drawing<'a> {
         let lines = LineStrips3D::new(active.iter().map(|f| [show(&f.p_joint), show(&f.p_cartesian)]))
             .with_colors(active.iter().map(|f| palette::fade(palette::finger(f.finger), 0.4 + 0.6 * f.k)))
             .with_radii([0.0008]);
-        stream.log("robot/hand/target/blend", &lines)?;
-        let dots = |positions: Vec<[f32; 3]>, color: Color, radius: f32| {
-            Points3D::new(positions).with_colors([color]).with_radii([radius])
-        };
-        let p_joint = mapping.fingers().iter().map(|f| show(&f.p_joint)).collect();
-        stream.log("robot/hand/target/p_Q", &dots(p_joint, palette::JOINT, 0.0032))?;
-        let p_cartesian = active.iter().map(|f| show(&f.p_cartesian)).collect();
-        stream.log("robot/hand/target/p_C", &dots(p_cartesian, palette::CARTESIAN, 0.0036))?;
-        let p_input = active.iter().map(|f| show(&f.p_input)).collect();
-        stream.log("robot/hand/target/p_input", &dots(p_input, palette::BLEND, 0.0044))
+        stream.log("robot/hand/blend", &lines)?;
+        let mut dots: Vec<([f32; 3], Color, f32)> = Vec::with_capacity(3 * mapping.fingers().len());
+        dots.extend(mapping.fingers().iter().map(|f| (show(&f.p_joint), palette::JOINT, 0.0032)));
+        dots.extend(active.iter().map(|f| (show(&f.p_cartesian), palette::CARTESIAN, 0.0036)));
+        dots.extend(active.iter().map(|f| (show(&f.p_input), palette::BLEND, 0.0044)));
+        let points = Points3D::new(dots.iter().map(|dot| dot.0))
+            .with_colors(dots.iter().map(|dot| dot.1))
+            .with_radii(dots.iter().map(|dot| dot.2));
+        stream.log("robot/hand/targets", &points)
     }
 }
 

@@ -2,8 +2,8 @@ use rerun::{Color, RecordingStream, RecordingStreamResult, Scalars, SeriesLines,
 
 use super::super::TIMELINE;
 
-/// Samples sent together: at 50 Hz ten chunks a second and entity instead of fifty.
-const BATCH: usize = 5;
+/// Samples sent together: at 50 Hz five chunks a second and entity instead of fifty.
+const BATCH: usize = 10;
 
 /// One line of a plot.
 pub(super) struct Curve {
