@@ -5,9 +5,18 @@
 //! | [`control`] | the tick: gate, watchdog, mapping, conditioning; pure |
 //! | [`driver`] | the joint interface of a hand; the simulated hand |
 //! | [`runtime`] | the real-time thread around the tick |
+//! | [`receive`] | poses from the network into the slot of the control loop |
+//! | [`telemetry`] | state, mapping and health to the network and the viewer |
+//! | [`retarget`] | whole recordings offline |
 //! | [`config`] | configuration, checked |
+//! | [`cli`], [`app`] | command line; wiring and shutdown |
 
+pub mod app;
+pub mod cli;
 pub mod config;
 pub mod control;
 pub mod driver;
+pub mod receive;
+pub mod retarget;
 pub mod runtime;
+pub mod telemetry;

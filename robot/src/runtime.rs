@@ -14,8 +14,9 @@ use std::thread::JoinHandle;
 use std::time::Duration;
 
 use rustix::thread::clock_nanosleep_absolute;
-use rustix::time::{ClockId, Timespec, clock_gettime};
+use rustix::time::{ClockId, Timespec};
 use teleop_common::hand::JointVector;
+use teleop_common::net::clock::now;
 use teleop_common::time::MonoTime;
 use thread_priority::{
     RealtimeThreadSchedulePolicy, ThreadPriority, ThreadPriorityValue, ThreadSchedulePolicy,
@@ -91,13 +92,6 @@ pub enum StartError {
         /// Why.
         source: DriverError,
     },
-}
-
-/// Now, by the clock that the control loop, the network and the viewer share.
-#[must_use]
-pub fn now() -> MonoTime {
-    let time = clock_gettime(ClockId::Monotonic);
-    MonoTime(u64::try_from(time.tv_sec).unwrap_or(0) * 1_000_000_000 + u64::try_from(time.tv_nsec).unwrap_or(0))
 }
 
 impl ControlThread {

@@ -3,8 +3,8 @@ use std::time::Duration;
 use teleop_common::hand::{HandModel, JointVector};
 use teleop_common::mapping::{MappingOutput, MappingParams, ParamError, Retargeter};
 use teleop_common::master::MasterPose;
-use teleop_common::time::MonoTime;
 use teleop_common::mode::Mode;
+use teleop_common::time::MonoTime;
 
 use super::Conditioner;
 use crate::driver::{JointCommand, JointState};
@@ -183,9 +183,9 @@ impl Controller {
     /// The next command, or `None` if it would not be finite.
     fn command(&mut self, now: MonoTime, newest: Option<&PoseSample>, state: &JointState) -> Option<JointCommand> {
         let (params, retargeter) = (self.params, &mut self.retargeter);
-        let conditioner = self.conditioner.get_or_insert_with(|| {
-            Conditioner::new(retargeter.hand(), &state.q, 1.0 / params.rate, params.smoothing)
-        });
+        let conditioner = self
+            .conditioner
+            .get_or_insert_with(|| Conditioner::new(retargeter.hand(), &state.q, 1.0 / params.rate, params.smoothing));
         let fresh = newest.filter(|sample| now.since(sample.received) <= params.hold_after);
         if let Some(sample) = fresh {
             let known = self.sample.as_ref().map(|last| (last.epoch, last.sequence));
@@ -204,8 +204,10 @@ impl Controller {
         match (self.mode, &self.mapping) {
             (Mode::Engaged, Some(mapping)) => {
                 let since = now.since(self.engaged_at).as_secs_f64();
-                let speed = if since < params.engage_ramp { params.engage_speed * (1.0 + 9.0 * since / params.engage_ramp) } else { f64::INFINITY };
-                conditioner.follow(&mapping.q, speed);
+                // The limit widens tenfold over the ramp, then only the joints' own limits count.
+                let ramp = since < params.engage_ramp;
+                let widened = params.engage_speed * (1.0 + 9.0 * since / params.engage_ramp);
+                conditioner.follow(&mapping.q, if ramp { widened } else { f64::INFINITY });
             }
             _ => conditioner.hold(),
         }

@@ -12,4 +12,4 @@ mod gate;
 
 pub use conditioner::{Conditioner, JointLimits};
 pub use controller::{ControlParams, Controller, Fault, PoseSample, TickRecord};
-pub use gate::{Gate, GateParams, Reject};
+pub use gate::{Gate, GateParams};

@@ -1,0 +1,225 @@
+//! The command line.
+
+use std::path::PathBuf;
+
+use clap::{Args, Parser, Subcommand, ValueEnum};
+use teleop_common::hand::HandSide;
+use teleop_common::mapping::MappingMode;
+use teleop_common::viz::Viewer;
+
+use crate::config::{HandSource, Overrides};
+use crate::runtime::Realtime;
+
+const EXAMPLES: &str = "\
+Examples:
+  robot                                     a simulated right Allegro Hand on this machine, picture in the browser
+  robot --hand left --name lefty            the left hand, under another name
+  robot --listen tcp/0.0.0.0:7447           let an operator on another machine connect
+  robot --preset paper --mode cartesian     the paper's parameters, Cartesian mapping only
+  robot --viewer connect=192.168.0.5        show in the viewer of another machine
+  robot retarget --input hand.csv --output joints.jsonl
+  robot viewer --bind 0.0.0.0               only the viewer, for other processes to connect to
+
+Configuration file (--config FILE), every value optional:
+  preset = \"default\"          # or \"paper\"
+  [mapping]                   # mode, r1, r2 (m), scale, anchor, joint_map, gain, thumb_gain
+  r2 = 0.06
+  [control]                   # rate_hz, hold_after_s, max_age_s, smoothing_s, engage_speed_rad_s, engage_ramp_s,
+  hold_after_s = 0.2          # velocity_scale, acceleration_scale
+
+Exit codes: 0 done (also after Ctrl-C), 1 failed while running, 2 wrong usage or configuration.";
+
+/// Drives a robot hand with the poses of a human hand.
+#[derive(Debug, Parser)]
+#[command(name = "robot", version, after_help = EXAMPLES, args_conflicts_with_subcommands = true)]
+pub struct Cli {
+    /// What to do; driving the hand if nothing is said.
+    #[command(subcommand)]
+    pub command: Option<Command>,
+    /// Options of `run`.
+    #[command(flatten)]
+    pub run: RunArgs,
+}
+
+/// What `robot` can do.
+#[derive(Debug, Subcommand)]
+pub enum Command {
+    /// Drive the hand (this is what `robot` alone does)
+    #[command(after_help = EXAMPLES)]
+    Run(RunArgs),
+    /// Map a whole recording to joint angles, as fast as possible
+    Retarget(RetargetArgs),
+    /// Host the viewer for other processes (--viewer connect=HOST) and nothing else
+    Viewer(ViewerArgs),
+}
+
+/// Which hand.
+#[derive(Clone, Copy, Debug, ValueEnum)]
+pub enum Side {
+    /// The right hand.
+    Right,
+    /// The left hand.
+    Left,
+}
+
+/// Which mapping.
+#[derive(Clone, Copy, Debug, ValueEnum)]
+pub enum Mode {
+    /// Joint mapping far from the thumb, Cartesian near it.
+    Combined,
+    /// Joint angles only.
+    Joint,
+    /// Fingertip positions only.
+    Cartesian,
+}
+
+/// The hand and its mapping.
+#[derive(Args, Clone, Debug)]
+pub struct HandArgs {
+    /// Which Allegro Hand
+    #[arg(long, value_enum, default_value = "right", help_heading = "Hand")]
+    pub hand: Side,
+    /// A URDF instead of the built-in one
+    #[arg(long, value_name = "FILE", help_heading = "Hand")]
+    pub urdf: Option<PathBuf>,
+    /// A hand description (TOML) instead of the built-in one
+    #[arg(long, value_name = "FILE", help_heading = "Hand")]
+    pub description: Option<PathBuf>,
+    /// How the human hand is mapped [default: combined]
+    #[arg(long, value_enum, help_heading = "Mapping")]
+    pub mode: Option<Mode>,
+    /// Parameters to start from: default or paper [default: default]
+    #[arg(long, value_name = "NAME", help_heading = "Mapping")]
+    pub preset: Option<String>,
+    /// Configuration file, see below
+    #[arg(long, value_name = "FILE", help_heading = "Mapping")]
+    pub config: Option<PathBuf>,
+    /// Control ticks per second [default: 333]
+    #[arg(long, value_name = "HZ", help_heading = "Mapping")]
+    pub rate: Option<f64>,
+}
+
+/// How much to tell.
+#[derive(Args, Clone, Debug)]
+pub struct LogArgs {
+    /// What to log to stderr, as in RUST_LOG (which it overrides): a level, or target=level pairs
+    #[arg(long, value_name = "FILTER", help_heading = "Logging")]
+    pub log: Option<String>,
+}
+
+/// Options of `robot run`.
+#[derive(Args, Clone, Debug)]
+pub struct RunArgs {
+    /// The robot's name; operators use the same
+    #[arg(long, default_value = "allegro", value_name = "NAME")]
+    pub name: String,
+    /// Hand and mapping.
+    #[command(flatten)]
+    pub hand: HandArgs,
+    /// Where operators connect; repeatable
+    #[arg(long, default_value = "tcp/127.0.0.1:7447", value_name = "ENDPOINT", help_heading = "Network")]
+    pub listen: Vec<String>,
+    /// A zenoh configuration file for certificates and link options
+    #[arg(long, value_name = "FILE", help_heading = "Network")]
+    pub zenoh: Option<PathBuf>,
+    /// The picture: web, web=ADDRESS, connect=URL, save=FILE.rrd or off
+    #[arg(long, default_value = "web", value_name = "VIEWER")]
+    pub viewer: Viewer,
+    /// Real-time priority of the control thread
+    #[arg(long, value_enum, default_value = "auto")]
+    pub realtime: Realtime,
+    /// End after this many seconds
+    #[arg(long, value_name = "SECONDS", value_parser = seconds)]
+    pub duration: Option<f64>,
+    /// Logging.
+    #[command(flatten)]
+    pub log: LogArgs,
+}
+
+/// Options of `robot retarget`.
+#[derive(Args, Clone, Debug)]
+pub struct RetargetArgs {
+    /// Recording: JSON lines with `q` or `keypoints`, or CSV of keypoints
+    #[arg(long, value_name = "FILE")]
+    pub input: PathBuf,
+    /// Where to write, JSON lines, one per frame; appears only when complete
+    #[arg(long, value_name = "FILE")]
+    pub output: PathBuf,
+    /// Hand and mapping.
+    #[command(flatten)]
+    pub hand: HandArgs,
+    /// off: the pure mapping; on: what the live robot commands when it gets these frames at these times
+    #[arg(long, value_enum, default_value = "off")]
+    pub conditioning: Switch,
+    /// Sizes of the person's hand, from `operator calibrate`; without it keypoints are measured from the recording
+    #[arg(long, value_name = "FILE")]
+    pub calibration: Option<PathBuf>,
+    /// Write the time that the mapping takes per frame, JSON
+    #[arg(long, value_name = "FILE")]
+    pub stats: Option<PathBuf>,
+    /// Logging.
+    #[command(flatten)]
+    pub log: LogArgs,
+}
+
+/// Options of `robot viewer`.
+#[derive(Args, Clone, Debug)]
+pub struct ViewerArgs {
+    /// Address to serve on; 0.0.0.0 for all
+    #[arg(long, default_value = "127.0.0.1", value_name = "IP")]
+    pub bind: std::net::IpAddr,
+    /// Logging.
+    #[command(flatten)]
+    pub log: LogArgs,
+}
+
+/// On or off.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum Switch {
+    /// Yes.
+    On,
+    /// No.
+    Off,
+}
+
+impl HandArgs {
+    /// What overrides the configuration file.
+    #[must_use]
+    pub fn overrides(&self) -> Overrides {
+        let mode = self.mode.map(|mode| match mode {
+            Mode::Combined => MappingMode::Combined,
+            Mode::Joint => MappingMode::Joint,
+            Mode::Cartesian => MappingMode::Cartesian,
+        });
+        Overrides { preset: self.preset.clone(), mode, rate: self.rate }
+    }
+
+    /// Where the hand comes from.
+    #[must_use]
+    pub fn source(&self) -> HandSource {
+        let side = match self.hand {
+            Side::Right => HandSide::Right,
+            Side::Left => HandSide::Left,
+        };
+        HandSource { side, urdf: self.urdf.clone(), description: self.description.clone() }
+    }
+}
+
+fn seconds(text: &str) -> Result<f64, String> {
+    match text.parse::<f64>() {
+        Ok(value) if value > 0.0 && value <= 1e7 => Ok(value),
+        _ => Err("it must be a number of seconds above 0".to_owned()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::CommandFactory as _;
+
+    use super::*;
+
+    #[test]
+    fn the_command_line_is_consistent() {
+        Cli::command().debug_assert();
+    }
+}

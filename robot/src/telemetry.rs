@@ -1,0 +1,218 @@
+//! From the control loop to the world: publishes state, mapping and health, and feeds the viewer.
+
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
+
+use teleop_common::hand::HandModel;
+use teleop_common::key::Keys;
+use teleop_common::mapping::MappingParams;
+use teleop_common::mode::Mode;
+use teleop_common::net::{NetError, Publisher, Session, Stream, clock};
+use teleop_common::time::{Histogram, MonoTime};
+use teleop_common::viz::{Level, Logger, RobotFrame};
+use teleop_common::wire::{
+    HealthMessage, JointStateMessage, MappingMessage, Quantiles, Rejection, Stamper, pack_joints,
+};
+
+use crate::control::Fault;
+use crate::receive::Receiver;
+use crate::runtime::LoopRecord;
+
+/// How often joint states and mapping signals go out, at most.
+const STATE_PERIOD: Duration = Duration::from_millis(10);
+const HEALTH_PERIOD: Duration = Duration::from_millis(200);
+/// How often the viewer gets a frame.
+const VIEW_PERIOD: Duration = Duration::from_millis(10);
+
+/// Turns the control loop's records into messages and frames. Owned by one thread.
+pub struct Telemetry {
+    receiver: Arc<Mutex<Receiver>>,
+    joints: (Publisher, Stamper),
+    mapping: (Publisher, Stamper),
+    health: (Publisher, Stamper),
+    logger: Logger,
+    params: MappingParams,
+    joint_count: u8,
+    next_state: MonoTime,
+    next_health: MonoTime,
+    next_view: MonoTime,
+    mode: Option<Mode>,
+    tick_times: Histogram,
+    slowest: Duration,
+    // Tick number and time of the last health message, for the measured rate.
+    rate_mark: Option<(u64, MonoTime)>,
+}
+
+impl Telemetry {
+    /// Declares the publishers.
+    ///
+    /// # Errors
+    /// The session is closed.
+    pub fn new(
+        session: &Session,
+        keys: &Keys,
+        epoch: u64,
+        receiver: Arc<Mutex<Receiver>>,
+        logger: Logger,
+        hand: &HandModel,
+        params: MappingParams,
+    ) -> Result<Self, NetError> {
+        let publisher =
+            |key: &str, stream| session.publisher(key, stream).map(|publisher| (publisher, Stamper::new(epoch)));
+        Ok(Self {
+            receiver,
+            joints: publisher(&keys.joints(), Stream::State)?,
+            mapping: publisher(&keys.mapping(), Stream::State)?,
+            health: publisher(&keys.health(), Stream::Slow)?,
+            logger,
+            params,
+            joint_count: u8::try_from(hand.joints.len()).unwrap_or(u8::MAX),
+            next_state: MonoTime(0),
+            next_health: MonoTime(0),
+            next_view: MonoTime(0),
+            mode: None,
+            tick_times: Histogram::default(),
+            slowest: Duration::ZERO,
+            rate_mark: None,
+        })
+    }
+
+    /// Takes one record; `dropped` records were lost so far.
+    pub fn on_record(&mut self, record: &LoopRecord, dropped: u64) {
+        self.tick_times.record(record.busy);
+        self.slowest = self.slowest.max(record.busy);
+        let now = record.record.now;
+        if self.mode != Some(record.record.mode) {
+            self.tell_mode(record);
+            // Whoever watches learns of a new mode at once.
+            self.next_state = now;
+            self.next_health = now;
+        }
+        if now >= self.next_state {
+            self.next_state = now + STATE_PERIOD;
+            self.publish_state(record);
+        }
+        if now >= self.next_health {
+            self.next_health = now + HEALTH_PERIOD;
+            self.publish_health(record, dropped);
+        }
+        if self.logger.enabled() && now >= self.next_view {
+            self.next_view = now + VIEW_PERIOD;
+            self.view(record);
+        }
+    }
+
+    fn publish_state(&mut self, record: &LoopRecord) {
+        let tick = &record.record;
+        let sample = tick.sample.as_ref();
+        let echo = self.receiver.lock().unwrap_or_else(PoisonError::into_inner).echo();
+        let message = JointStateMessage {
+            header: self.joints.1.header::<JointStateMessage>(clock::now()),
+            echo,
+            mode: tick.mode.to_wire(),
+            joints: self.joint_count,
+            tick: tick.tick,
+            wall_offset_ns: clock::wall_offset_ns(),
+            pose_epoch: sample.map_or(0, |sample| sample.epoch),
+            pose_seq: sample.map_or(0, |sample| sample.sequence),
+            pose_captured: sample.map_or(MonoTime(0), |sample| sample.captured_remote),
+            q: pack_joints(&tick.state.q),
+            dq: pack_joints(&tick.state.dq),
+            tau: pack_joints(&tick.state.tau),
+            q_command: pack_joints(&tick.command.q),
+        };
+        told_once(self.joints.0.send(&message));
+        if let Some(mapping) = &tick.mapping {
+            let header = self.mapping.1.header::<MappingMessage>(clock::now());
+            let message = MappingMessage::new(header, tick.tick, self.params.r1, self.params.r2, mapping);
+            told_once(self.mapping.0.send(&message));
+        }
+    }
+
+    fn publish_health(&mut self, record: &LoopRecord, dropped: u64) {
+        let tick = &record.record;
+        let rate = self.rate_mark.map_or(0.0, |(ticks, at)| {
+            let seconds = tick.now.since(at).as_secs_f64();
+            if seconds > 0.0 { (tick.tick - ticks) as f64 / seconds } else { 0.0 }
+        });
+        self.rate_mark = Some((tick.tick, tick.now));
+        let counts = self.receiver.lock().unwrap_or_else(PoisonError::into_inner).counts().clone();
+        let message = HealthMessage {
+            header: self.health.1.header::<HealthMessage>(clock::now()),
+            mode: tick.mode.to_wire(),
+            fault: tick.fault as u8,
+            ticks: tick.tick,
+            overruns: record.overruns,
+            tick_us: Quantiles::of(&self.tick_times, 1e-6),
+            poses_accepted: counts.accepted,
+            rejected: counts.rejected,
+            holds: tick.holds,
+            age_ms: Quantiles::of(&counts.age, 1e-3),
+            telemetry_dropped: dropped,
+            rate_hz: rate as f32,
+        };
+        told_once(self.health.0.send(&message));
+    }
+
+    fn view(&mut self, record: &LoopRecord) {
+        let tick = &record.record;
+        self.logger.log_robot(RobotFrame {
+            time: wall(tick.now),
+            q: tick.state.q,
+            dq: tick.state.dq,
+            q_command: tick.command.q,
+            mapping: tick.mapping,
+            mode: tick.mode,
+            pose_age: tick.sample.map(|sample| tick.now.since(sample.captured).as_secs_f64()),
+            tick: Some(self.slowest.as_secs_f64()),
+        });
+        self.slowest = Duration::ZERO;
+    }
+
+    /// A change of mode, in the log and in the viewer.
+    fn tell_mode(&mut self, record: &LoopRecord) {
+        let tick = &record.record;
+        self.mode = Some(tick.mode);
+        let (level, text) = match tick.mode {
+            Mode::Idle => (Level::Info, "idle: waiting for an operator".to_owned()),
+            Mode::Engaged => {
+                let operator = tick.sample.map_or(0, |sample| sample.epoch);
+                (Level::Info, format!("engaged: following operator {operator:016x}"))
+            }
+            Mode::Holding => {
+                let rejected = self.receiver.lock().unwrap_or_else(PoisonError::into_inner).counts().rejected;
+                let reasons: Vec<_> = Rejection::ALL.iter().filter(|reason| rejected[reason.index()] > 0).collect();
+                let reasons: Vec<_> =
+                    reasons.iter().map(|reason| format!("{} {}", rejected[reason.index()], reason.name())).collect();
+                let refused = if reasons.is_empty() { "none".to_owned() } else { reasons.join(", ") };
+                (Level::Warn, format!("holding: no fresh pose (refused so far: {refused})"))
+            }
+            Mode::Faulted => {
+                let why = match (tick.fault, record.driver_error) {
+                    (Fault::Driver, Some(error)) => error.to_string(),
+                    (fault, _) => format!("{fault:?}"),
+                };
+                (Level::Error, format!("faulted: the hand is off until a restart: {why}"))
+            }
+        };
+        match level {
+            Level::Info => tracing::info!("{text}"),
+            Level::Warn => tracing::warn!("{text}"),
+            Level::Error => tracing::error!("{text}"),
+        }
+        self.logger.log_text(wall(tick.now), level, &text);
+    }
+}
+
+/// A time of the monotonic clock as ns since the UNIX epoch.
+fn wall(time: MonoTime) -> i64 {
+    i64::try_from(time.0).unwrap_or(i64::MAX).saturating_add(clock::wall_offset_ns())
+}
+
+/// A message that cannot be sent is a fault of this program or the end of the session: worth a line, not a stop.
+fn told_once(result: Result<(), NetError>) {
+    static TOLD: std::sync::Once = std::sync::Once::new();
+    if let Err(error) = result {
+        TOLD.call_once(|| tracing::error!("state is not published: {error}"));
+    }
+}
