@@ -1,34 +1,25 @@
-//! Wiring: from the command line to running threads, and their end in order.
+//! The program: logging, signals, exit codes, and which command runs.
 
 use std::process::ExitCode;
 use std::sync::Arc;
-use std::sync::atomic::Ordering;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use anyhow::{Context as _, anyhow};
-use teleop_common::hand::HandSide;
 use teleop_common::key::Keys;
-use teleop_common::master::{Gesture, MasterGeometry};
-use teleop_common::net::clock::{now, random_epoch};
-use teleop_common::net::{NetError, Session, SessionConfig, Stream};
-use teleop_common::viz::{Scene, Viz};
+use teleop_common::master::Gesture;
+use teleop_common::net::clock::random_epoch;
+use teleop_common::net::{NetError, Session, SessionConfig};
 
-use crate::cli::{Cli, Command, LogArgs, RunArgs, WatchArgs};
+use crate::calibrate;
+use crate::cli::{Cli, Command, LogArgs, WatchArgs};
 use crate::feedback::{Feedback, subscribe};
-use crate::hand::PoseFinder;
-use crate::pipeline::{Parts, Pipeline};
+use crate::run::run;
 use crate::shutdown::Shutdown;
-use crate::source::{GestureSource, Source, SourceError};
-use crate::stream::PoseStream;
-use crate::terminal::{RateMeter, Status, Terminal, say};
+use crate::terminal::{Terminal, say};
 use crate::watch::{WatchOptions, watch};
 
-/// Default log filter: the libraries speak up when something is wrong.
-const LOG_FILTER: &str = "info,zenoh=warn,re_=warn,rerun=warn";
-/// Refresh of the status line.
-const REFRESH: Duration = Duration::from_millis(200);
-/// Time the viewer gets to take what is queued.
-const VIEWER_TIMEOUT: Duration = Duration::from_millis(500);
+/// Default log filter. zenoh warns of its own settings at every start; what matters of it shows in the status line.
+const LOG_FILTER: &str = "info,zenoh=error,re_=warn,rerun=warn";
 
 /// Why the program ends other than well.
 #[derive(Debug)]
@@ -57,7 +48,7 @@ impl std::fmt::Display for Failure {
     }
 }
 
-trait OrFail<T> {
+pub(crate) trait OrFail<T> {
     /// The failure is in what the user asked for.
     fn or_usage(self) -> Result<T, Failure>;
     /// The failure came while running.
@@ -101,7 +92,7 @@ pub fn main(cli: Cli) -> Result<(), Failure> {
     watch_signals(&runtime, &shutdown).context("cannot watch for signals").or_runtime()?;
     let result = match command {
         Command::Run(args) => run(&args, &shutdown, &terminal).map(|summary| say(&summary.to_string())),
-        Command::Calibrate(_) => Err(Failure::Usage(anyhow!("calibrate is not available yet"))),
+        Command::Calibrate(args) => calibrate::calibrate(&args, &shutdown),
         Command::Watch(args) => watch_robot(&args, &shutdown),
         Command::Gestures => {
             gestures();
@@ -179,124 +170,4 @@ fn watch_robot(args: &WatchArgs, shutdown: &Shutdown) -> Result<(), Failure> {
         endpoints: args.robot.connect.join(", "),
     };
     watch(&feedback, &options, shutdown).or_runtime()
-}
-
-/// How a run went.
-#[derive(Clone, Copy, Debug)]
-pub struct Summary {
-    /// Poses handed to the network.
-    pub sent: u64,
-    /// Time from the first to the last of them.
-    pub streamed: Duration,
-    /// Median and 99th percentile of the round trip, `None` if the robot never answered.
-    pub round_trip: Option<(Duration, Duration)>,
-    /// Poses that came too late to be sent.
-    pub skipped: u64,
-    /// Messages of a live source that were no hand.
-    pub bad_input: u64,
-    /// Frames written to the recording, if there is one, and frames lost.
-    pub recorded: Option<(u64, u64)>,
-    /// Whether the robot confirmed the last pose.
-    pub confirmed: bool,
-}
-
-impl std::fmt::Display for Summary {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let seconds = self.streamed.as_secs_f64();
-        write!(f, "streamed {} poses in {seconds:.1} s", self.sent)?;
-        if self.sent > 1 && seconds > 0.0 {
-            write!(f, " ({:.1} Hz)", (self.sent - 1) as f64 / seconds)?;
-        }
-        match self.round_trip {
-            Some((p50, p99)) => {
-                write!(f, ", round trip {:.1} ms p50, {:.1} ms p99", 1e3 * p50.as_secs_f64(), 1e3 * p99.as_secs_f64())?;
-            }
-            None => write!(f, ", no answer from the robot")?,
-        }
-        write!(f, ", {} skipped", self.skipped)?;
-        if self.bad_input > 0 {
-            write!(f, ", {} bad inputs", self.bad_input)?;
-        }
-        if let Some((written, lost)) = self.recorded {
-            write!(f, ", recorded {written} frames")?;
-            if lost > 0 {
-                write!(f, " ({lost} LOST)")?;
-            }
-        }
-        Ok(())
-    }
-}
-
-/// Streams until the source ends, the time is over or the process is asked to end.
-///
-/// # Errors
-/// [`Failure`]
-pub fn run(args: &RunArgs, shutdown: &Shutdown, terminal: &Terminal) -> Result<Summary, Failure> {
-    let start = Instant::now();
-    let end = args.duration.map(|seconds| start + Duration::from_secs_f64(seconds));
-    let keys = Keys::new(&args.robot.name).or_usage()?;
-    let gesture: Gesture = args.source.parse().map_err(SourceError::Unknown).or_usage()?;
-    let source = Source::Gesture(GestureSource::new(gesture, args.rate));
-
-    let epoch = random_epoch();
-    let feedback = Arc::new(Feedback::new(epoch));
-    let session = open_session(&args.robot.connect, &[])?;
-    let subscribers = subscribe(&session, &keys, &feedback).or_runtime()?;
-    let publisher = session.publisher(&keys.pose(), Stream::Command).or_runtime()?;
-    let token = session.live_token(&keys.live_operator(epoch)).or_runtime()?;
-    let viz = Viz::start(args.viewer.clone(), Scene::operator(keys.name(), HandSide::Right)).or_runtime()?;
-    let (stream, sender) = PoseStream::start(publisher, epoch, Arc::clone(&feedback)).or_runtime()?;
-    let pipeline = Pipeline::start(Parts {
-        source,
-        finder: PoseFinder::angles(MasterGeometry::PARADIGMATIC),
-        sender,
-        logger: viz.logger(),
-        feedback: Arc::clone(&feedback),
-        wait_for_robot: false,
-        shutdown: shutdown.clone(),
-    })
-    .or_runtime()?;
-
-    let mut display = terminal.display(false);
-    let mut meter = RateMeter::default();
-    while !pipeline.is_finished() {
-        let progress = pipeline.progress();
-        display.show(&Status {
-            name: keys.name().to_owned(),
-            endpoints: args.robot.connect.join(", "),
-            robot: feedback.snapshot(now()),
-            activity: progress.activity,
-            rate: meter.rate(stream.counters().sent.load(Ordering::Relaxed), Instant::now()),
-            progress: progress.fraction,
-            residual: progress.residual,
-            skipped: progress.skipped,
-            bad_input: progress.bad,
-            lost: 0,
-        });
-        let wait = end.map_or(REFRESH, |end| end.saturating_duration_since(Instant::now()).min(REFRESH));
-        if shutdown.wait(wait) || end.is_some_and(|end| Instant::now() >= end) {
-            break;
-        }
-    }
-    shutdown.request();
-    drop(display);
-    let (progress, result) = pipeline.join();
-    let sent = stream.counters().sent.load(Ordering::Relaxed);
-    drop(stream);
-    drop((token, subscribers));
-    let round_trips = feedback.round_trips();
-    if !viz.shutdown(VIEWER_TIMEOUT) {
-        tracing::warn!("the viewer did not take everything in time");
-    }
-    session.close().or_runtime()?;
-    result.or_runtime()?;
-    Ok(Summary {
-        sent,
-        streamed: progress.span.map_or(Duration::ZERO, |(first, last)| last.since(first)),
-        round_trip: (round_trips.count() > 0).then(|| (round_trips.p50(), round_trips.p99())),
-        skipped: progress.skipped,
-        bad_input: progress.bad,
-        recorded: None,
-        confirmed: progress.confirmed,
-    })
 }

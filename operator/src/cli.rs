@@ -91,13 +91,14 @@ pub struct RunArgs {
     /// Play a recording again and again; the pose jumps where it starts over, which the robot turns into a bounded move
     #[arg(long = "loop")]
     pub repeat: bool,
-    /// Sizes of the person's hand, from `operator calibrate`; without it keypoints are measured first
+    /// Sizes of the person's hand, from `operator calibrate`; without it keypoints are measured first: a recording as
+    /// a whole before it plays, a live hand for 3 s before it is followed
     #[arg(long, value_name = "FILE")]
     pub calibration: Option<PathBuf>,
     /// Where hand data of `--source zenoh` may arrive; repeatable
     #[arg(long, default_value = INPUT_ENDPOINT, value_name = "ENDPOINT")]
     pub listen: Vec<String>,
-    /// Record what is streamed into this file, JSON lines
+    /// Record what is streamed (joint angles, with the hand's sizes) into this new file, JSON lines
     #[arg(long, value_name = "FILE.jsonl")]
     pub record: Option<PathBuf>,
     /// The picture: web, web=ADDRESS, connect=URL, save=FILE.rrd or off
@@ -120,9 +121,9 @@ pub struct CalibrateArgs {
     /// Where to save the sizes
     #[arg(long, value_name = "FILE")]
     pub output: PathBuf,
-    /// How long to watch a live hand, or how much of a recording to use
-    #[arg(long, default_value_t = 5.0, value_name = "SECONDS", value_parser = seconds)]
-    pub seconds: f64,
+    /// How long to measure a live hand (default: 5), or how much of a recording to use (default: all)
+    #[arg(long, value_name = "SECONDS", value_parser = seconds)]
+    pub seconds: Option<f64>,
     /// The robot's name in the key of live keypoints
     #[arg(long, default_value = "allegro", value_name = "NAME")]
     pub name: String,

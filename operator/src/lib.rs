@@ -8,15 +8,21 @@
 //! | [`stream`] | the publisher thread behind a latest-value slot |
 //! | [`feedback`] | the robot as last heard, round trip, clock offset |
 //! | [`terminal`] | the status line |
+//! | [`record`] | the recording of what is streamed |
+//! | [`run`] | `operator run`: the wiring of the above |
+//! | [`calibrate`] | `operator calibrate` |
 //! | [`watch`] | `operator watch` |
 //! | [`shutdown`] | ending in order |
-//! | [`cli`], [`app`] | the command line and the wiring |
+//! | [`cli`], [`app`] | the command line; logging, signals, exit codes |
 
 pub mod app;
+pub mod calibrate;
 pub mod cli;
 pub mod feedback;
 pub mod hand;
 pub mod pipeline;
+pub mod record;
+pub mod run;
 pub mod shutdown;
 pub mod source;
 pub mod stream;

@@ -10,14 +10,17 @@ use teleop_common::time::MonoTime;
 use teleop_common::viz::{Logger, OperatorFrame};
 
 use crate::feedback::Feedback;
-use crate::hand::{HandError, PoseFinder, Posed};
+use crate::hand::{PoseFinder, Posed};
+use crate::record::RecordSender;
 use crate::shutdown::Shutdown;
 use crate::source::{Poll, Source, SourceError, SourceFrame};
 use crate::stream::{Outgoing, PoseSender};
-use crate::terminal::Activity;
+use crate::terminal::{Activity, chain};
 
 /// Longest wait without a look at whether the process ends.
 const LOOK: Duration = Duration::from_millis(50);
+/// A live source that was silent for this long is waited for.
+const SILENCE: Duration = Duration::from_millis(500);
 /// How often the last pose of a recording is repeated until the robot has it, ...
 const CONFIRM_EVERY: Duration = Duration::from_millis(20);
 /// ... and for how long.
@@ -30,9 +33,6 @@ pub enum PipelineError {
     /// The source failed.
     #[error(transparent)]
     Source(#[from] SourceError),
-    /// What it gives is no hand that can be followed.
-    #[error(transparent)]
-    Hand(#[from] HandError),
     /// The thread panicked.
     #[error("the source thread panicked")]
     Panic,
@@ -53,8 +53,12 @@ pub struct Progress {
     pub span: Option<(MonoTime, MonoTime)>,
     /// Frames that came too late to be sent.
     pub skipped: u64,
-    /// Messages that were no hand, and frames that could not be fitted.
+    /// Messages that were no hand.
     pub bad: u64,
+    /// Why the hand cannot be followed.
+    pub problem: Option<String>,
+    /// Whether the source came to its end.
+    pub ended: bool,
     /// Whether the robot confirmed the last pose of a source that has an end.
     pub confirmed: bool,
 }
@@ -67,6 +71,8 @@ pub struct Parts {
     pub finder: PoseFinder,
     /// Where poses go.
     pub sender: PoseSender,
+    /// Where they are recorded.
+    pub recorder: Option<RecordSender>,
     /// Where they are drawn.
     pub logger: Logger,
     /// The robot as last heard.
@@ -90,7 +96,7 @@ impl Pipeline {
     /// The system refuses a thread.
     pub fn start(parts: Parts) -> std::io::Result<Self> {
         let progress = Arc::new(Mutex::new(Progress::default()));
-        let worker = Worker { progress: Arc::clone(&progress), last: None, parts };
+        let worker = Worker { progress: Arc::clone(&progress), last: None, seen: None, parts };
         let thread = std::thread::Builder::new().name("source".to_owned()).spawn(move || worker.run())?;
         Ok(Self { progress, thread })
     }
@@ -125,6 +131,8 @@ struct Worker {
     parts: Parts,
     progress: Arc<Mutex<Progress>>,
     last: Option<Outgoing>,
+    /// When the newest frame came.
+    seen: Option<MonoTime>,
 }
 
 impl Worker {
@@ -141,7 +149,7 @@ impl Worker {
         let start = now();
         while !self.parts.shutdown.requested() {
             match self.parts.source.poll(now().since(start))? {
-                Poll::Frame(frame) => self.take(&frame)?,
+                Poll::Frame(frame) => self.take(&frame),
                 Poll::WaitUntil(due) => {
                     let left = (start + due).since(now());
                     if left > LOOK {
@@ -162,42 +170,51 @@ impl Worker {
 
     /// Waits for a live source.
     fn idle(&mut self) {
-        let bad = self.parts.source.bad_input();
         let came = self.parts.source.wait(LOOK);
+        let silent = self.seen.is_none_or(|seen| now().since(seen) > SILENCE);
         let mut progress = lock(&self.progress);
-        progress.bad = bad;
-        if !came && progress.poses == 0 && progress.activity == Activity::Streaming {
+        progress.bad = self.parts.source.bad_input();
+        if !came && silent {
             progress.activity = Activity::Waiting("hand data");
         }
     }
 
-    fn take(&mut self, frame: &SourceFrame) -> Result<(), PipelineError> {
+    fn take(&mut self, frame: &SourceFrame) {
         let captured = frame.captured.unwrap_or_else(now);
-        let posed = self.parts.finder.pose(frame.time, &frame.hand)?;
-        let residual = match &posed {
-            Posed::Pose { pose, residual } => {
-                let outgoing = Outgoing { captured, pose: *pose };
-                self.parts.sender.send(outgoing);
-                self.last = Some(outgoing);
-                self.draw(&outgoing, *residual);
-                *residual
+        self.seen = Some(captured);
+        let posed = self.parts.finder.pose(frame.time, &frame.hand, frame.jump);
+        if let Posed::Pose { pose, residual } = posed {
+            let outgoing = Outgoing { captured, pose };
+            self.parts.sender.send(outgoing);
+            self.last = Some(outgoing);
+            if let Some(recorder) = &self.parts.recorder {
+                recorder.record(&outgoing);
             }
-            _ => None,
-        };
+            self.draw(&outgoing, residual);
+        }
         let mut progress = lock(&self.progress);
         progress.skipped += frame.skipped;
         progress.fraction = self.parts.source.fraction();
         progress.bad = self.parts.source.bad_input();
         match posed {
-            Posed::Pose { .. } => {
+            Posed::Pose { residual, .. } => {
                 progress.activity = Activity::Streaming;
                 progress.residual = residual;
+                progress.problem = None;
                 progress.poses += 1;
                 progress.span = Some((progress.span.map_or(captured, |(first, _)| first), captured));
             }
-            Posed::Calibrating(done) => progress.activity = Activity::Calibrating(done),
+            Posed::Measuring { done } => progress.activity = Activity::Calibrating(done),
+            Posed::Refused(refusal) => {
+                progress.activity = Activity::Refused;
+                let problem = chain(&refusal);
+                // Told when it changes, not a hundred times a second.
+                if progress.problem.as_ref() != Some(&problem) {
+                    tracing::error!("{problem}");
+                    progress.problem = Some(problem);
+                }
+            }
         }
-        Ok(())
     }
 
     fn draw(&self, outgoing: &Outgoing, residual: Option<f64>) {
@@ -222,7 +239,11 @@ impl Worker {
 
     /// Repeats the last pose until the robot has it.
     fn confirm(&mut self) {
-        lock(&self.progress).activity = Activity::Finished;
+        {
+            let mut progress = lock(&self.progress);
+            progress.activity = Activity::Finished;
+            progress.ended = true;
+        }
         let Some(last) = self.last else { return };
         let end = now() + CONFIRM_FOR;
         let first = now();

@@ -9,6 +9,7 @@ use indicatif::{MultiProgress, ProgressBar, ProgressStyle};
 use teleop_common::mode::Mode;
 
 use crate::feedback::Snapshot;
+use crate::pipeline::Progress;
 
 /// Status lines of a program that is not watched on a terminal.
 const LINE_EVERY: Duration = Duration::from_secs(2);
@@ -23,6 +24,8 @@ pub enum Activity {
     Streaming,
     /// Measuring the hand; how far, 0 to 1.
     Calibrating(f64),
+    /// Getting a hand that cannot be followed; nothing is sent.
+    Refused,
     /// Waiting for something, which is named.
     Waiting(&'static str),
     /// The recording is over.
@@ -38,18 +41,10 @@ pub struct Status {
     pub endpoints: String,
     /// The robot as last heard.
     pub robot: Snapshot,
-    /// This operator's epoch, to tell whom the robot follows.
-    pub activity: Activity,
+    /// The source thread.
+    pub progress: Progress,
     /// Poses sent per second, of late.
     pub rate: f64,
-    /// How far a recording is, 0 to 1.
-    pub progress: Option<f64>,
-    /// Fit residual of keypoints (root mean square), m.
-    pub residual: Option<f64>,
-    /// Poses that came too late to be sent.
-    pub skipped: u64,
-    /// Messages of a live source that were no hand.
-    pub bad_input: u64,
     /// Frames missing in the recording that is being written.
     pub lost: u64,
 }
@@ -57,7 +52,7 @@ pub struct Status {
 /// The status line.
 #[must_use]
 pub fn status_line(status: &Status) -> String {
-    let Status { name, endpoints, robot, activity, rate, .. } = status;
+    let Status { name, endpoints, robot, progress, rate, lost } = status;
     let mut line = format!("robot {name}  ");
     let joints = robot.joints.as_ref().filter(|_| robot.connected);
     match (joints.and_then(|joints| joints.mode()), robot.reason) {
@@ -69,9 +64,10 @@ pub fn status_line(status: &Status) -> String {
         line.push_str("  |  ");
         line.push_str(&text);
     };
-    match activity {
+    match &progress.activity {
         Activity::Streaming => part(format!("{rate:.1} Hz")),
         Activity::Calibrating(done) => part(format!("calibrating {:.0} %", 100.0 * done)),
+        Activity::Refused => part("not streaming".to_owned()),
         Activity::Waiting(what) => part(format!("waiting for {what}")),
         Activity::Finished => part("finished".to_owned()),
     }
@@ -83,14 +79,14 @@ pub fn status_line(status: &Status) -> String {
     {
         part(format!("pose age at robot {:.1} ms (p99)", health.age_ms.p99));
     }
-    if let Some(residual) = status.residual {
+    if let Some(residual) = progress.residual {
         part(format!("fit {:.1} mm", residual * 1e3));
     }
-    if status.skipped > 0 {
-        part(format!("{} skipped", status.skipped));
+    if progress.skipped > 0 {
+        part(format!("{} skipped", progress.skipped));
     }
-    if status.bad_input > 0 {
-        part(format!("{} bad inputs", status.bad_input));
+    if progress.bad > 0 {
+        part(format!("{} bad inputs", progress.bad));
     }
     if robot.bad > 0 {
         part(format!("{} bad messages", robot.bad));
@@ -98,8 +94,11 @@ pub fn status_line(status: &Status) -> String {
     if robot.rivals {
         part(format!("ERROR: two robots are called {name}"));
     }
-    if status.lost > 0 {
-        part(format!("ERROR: {} frames missing in the recording", status.lost));
+    if *lost > 0 {
+        part(format!("ERROR: {lost} frames missing in the recording"));
+    }
+    if let Some(problem) = &progress.problem {
+        part(format!("ERROR: {problem}"));
     }
     line
 }
@@ -108,7 +107,13 @@ pub fn status_line(status: &Status) -> String {
 fn is_news(before: &Status, after: &Status) -> bool {
     let key = |status: &Status| {
         let mode: Option<Mode> = status.robot.joints.as_ref().and_then(|joints| joints.mode());
-        (status.robot.connected, mode, std::mem::discriminant(&status.activity), status.lost > 0, status.robot.rivals)
+        (
+            status.robot.connected,
+            mode,
+            std::mem::discriminant(&status.progress.activity),
+            status.lost > 0,
+            status.robot.rivals,
+        )
     };
     key(before) != key(after)
 }
@@ -207,14 +212,15 @@ impl Display {
     pub fn show(&mut self, status: &Status) {
         if let Some(bars) = &self.bars {
             bars.line.set_message(status_line(status));
-            if let (Some(bar), Some(progress)) = (&bars.progress, status.progress) {
+            if let (Some(bar), Some(progress)) = (&bars.progress, status.progress.fraction) {
                 bar.set_position((progress.clamp(0.0, 1.0) * PROGRESS_STEPS as f64) as u64);
             }
             return;
         }
         let due = self.last.as_ref().is_none_or(|(at, before)| at.elapsed() >= LINE_EVERY || is_news(before, status));
         if due {
-            let progress = status.progress.map_or_else(String::new, |done| format!("  |  {:.0} %", 100.0 * done));
+            let progress =
+                status.progress.fraction.map_or_else(String::new, |done| format!("  |  {:.0} %", 100.0 * done));
             say(&format!("{}{progress}", status_line(status)));
             self.last = Some((Instant::now(), status.clone()));
         }
@@ -230,6 +236,19 @@ impl Drop for Display {
             bars.line.finish_and_clear();
         }
     }
+}
+
+/// An error with its causes, as one line.
+#[must_use]
+pub fn chain(error: &dyn std::error::Error) -> String {
+    let mut line = error.to_string();
+    let mut cause = error.source();
+    while let Some(error) = cause {
+        line.push_str(": ");
+        line.push_str(&error.to_string());
+        cause = error.source();
+    }
+    line
 }
 
 /// Prints a line for people. A reader that went away is no reason to fail.
@@ -308,12 +327,8 @@ mod tests {
             name: "allegro".to_owned(),
             endpoints: "tcp/127.0.0.1:7447".to_owned(),
             robot: feedback.snapshot(now),
-            activity: Activity::Streaming,
+            progress: Progress::default(),
             rate: 99.96,
-            progress: None,
-            residual: None,
-            skipped: 0,
-            bad_input: 0,
             lost: 0,
         }
     }
@@ -326,18 +341,19 @@ mod tests {
         );
         assert_eq!(status_line(&status(None)), "robot allegro  not connected (tcp/127.0.0.1:7447)  |  100.0 Hz");
         assert!(status_line(&status(Some(Mode::Holding))).starts_with("robot allegro  holding: no poses arrive  |"));
-        let busy = Status {
+        let progress = Progress {
             activity: Activity::Calibrating(0.4),
             residual: Some(0.0031),
             skipped: 2,
-            bad_input: 3,
-            lost: 4,
-            ..status(None)
+            bad: 3,
+            problem: Some("keypoints are those of a left hand".to_owned()),
+            ..Progress::default()
         };
+        let busy = Status { progress, lost: 4, ..status(None) };
         assert_eq!(
             status_line(&busy),
             "robot allegro  not connected (tcp/127.0.0.1:7447)  |  calibrating 40 %  |  fit 3.1 mm  |  2 skipped  |  \
-             3 bad inputs  |  ERROR: 4 frames missing in the recording"
+             3 bad inputs  |  ERROR: 4 frames missing in the recording  |  ERROR: keypoints are those of a left hand"
         );
     }
 
@@ -346,6 +362,6 @@ mod tests {
         let engaged = status(Some(Mode::Engaged));
         assert!(is_news(&engaged, &status(Some(Mode::Holding))));
         assert!(is_news(&engaged, &status(None)));
-        assert!(!is_news(&engaged, &Status { rate: 3.0, skipped: 9, ..engaged.clone() }));
+        assert!(!is_news(&engaged, &Status { rate: 3.0, ..engaged.clone() }));
     }
 }

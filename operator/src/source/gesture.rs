@@ -1,9 +1,9 @@
 use std::time::Duration;
 
 use teleop_common::master::Gesture;
+use teleop_common::recording::FrameData;
 
 use super::{Poll, SourceFrame};
-use crate::hand::Hand;
 
 /// A scripted gesture, over and over, at a steady rate.
 ///
@@ -40,8 +40,8 @@ impl GestureSource {
         let skipped = index - self.next;
         self.next = index + 1;
         let time = self.due(index);
-        let hand = Hand::Angles(self.gesture.sample(time.as_secs_f64()));
-        Poll::Frame(SourceFrame { time, captured: None, hand, skipped })
+        let hand = FrameData::Joints(self.gesture.sample(time.as_secs_f64()));
+        Poll::Frame(SourceFrame { time, captured: None, hand, skipped, jump: false })
     }
 }
 

@@ -1,0 +1,235 @@
+//! `operator run`: streams a hand to the robot.
+
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
+use std::time::{Duration, Instant};
+
+use anyhow::Context as _;
+use teleop_common::hand::HandSide;
+use teleop_common::key::Keys;
+use teleop_common::master::{Calibration, MasterGeometry};
+use teleop_common::net::clock::{now, random_epoch};
+use teleop_common::net::{Session, Stream};
+use teleop_common::viz::{Scene, Viz};
+
+use crate::app::{Failure, OrFail as _, open_session};
+use crate::calibrate;
+use crate::cli::RunArgs;
+use crate::feedback::{Feedback, subscribe};
+use crate::hand::PoseFinder;
+use crate::pipeline::{Parts, Pipeline, Progress};
+use crate::record::Recorder;
+use crate::shutdown::Shutdown;
+use crate::source::{GestureSource, RecordingFile, Source, SourceSpec, ZenohSource};
+use crate::stream::PoseStream;
+use crate::terminal::{RateMeter, Status, Terminal};
+
+/// Refresh of the status line.
+const REFRESH: Duration = Duration::from_millis(200);
+/// Time the viewer gets to take what is queued.
+const VIEWER_TIMEOUT: Duration = Duration::from_millis(500);
+
+/// How a run went.
+#[derive(Clone, Debug)]
+pub struct Summary {
+    /// Poses handed to the network.
+    pub sent: u64,
+    /// The source thread's own account.
+    pub progress: Progress,
+    /// Median and 99th percentile of the round trip, `None` if the robot never answered.
+    pub round_trip: Option<(Duration, Duration)>,
+    /// Frames written to the recording and frames lost, if there is a recording.
+    pub recorded: Option<(u64, u64)>,
+}
+
+impl std::fmt::Display for Summary {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let Self { sent, progress, round_trip, recorded } = self;
+        let seconds = progress.span.map_or(0.0, |(first, last)| last.since(first).as_secs_f64());
+        write!(f, "streamed {sent} poses in {seconds:.1} s")?;
+        if progress.poses > 1 && seconds > 0.0 {
+            write!(f, " ({:.1} Hz)", (progress.poses - 1) as f64 / seconds)?;
+        }
+        match round_trip {
+            Some((p50, p99)) => {
+                write!(f, ", round trip {:.1} ms p50, {:.1} ms p99", 1e3 * p50.as_secs_f64(), 1e3 * p99.as_secs_f64())?;
+            }
+            None => write!(f, ", no answer from the robot")?,
+        }
+        write!(f, ", {} skipped", progress.skipped)?;
+        if progress.bad > 0 {
+            write!(f, ", {} bad inputs", progress.bad)?;
+        }
+        if let Some((written, lost)) = recorded {
+            write!(f, ", recorded {written} frames")?;
+            if *lost > 0 {
+                write!(f, " ({lost} LOST)")?;
+            }
+        }
+        Ok(())
+    }
+}
+
+/// What is to be streamed, checked before anything is opened.
+struct Plan {
+    input: Input,
+    finder: PoseFinder,
+    side: Option<HandSide>,
+}
+
+enum Input {
+    Ready(Source),
+    Zenoh,
+}
+
+impl Plan {
+    fn new(args: &RunArgs) -> Result<Self, Failure> {
+        let spec = args.source.parse::<SourceSpec>().or_usage()?;
+        let calibration = args.calibration.as_deref().map(calibrate::load).transpose().or_usage()?;
+        match spec {
+            SourceSpec::Gesture(gesture) => {
+                let source = Source::Gesture(GestureSource::new(gesture, args.rate));
+                Ok(Self::with(Input::Ready(source), calibration.as_ref(), None))
+            }
+            SourceSpec::Zenoh => Ok(Self::with(Input::Zenoh, calibration.as_ref(), None)),
+            SourceSpec::File(path) => {
+                let recording = RecordingFile::scan(&path).or_usage()?;
+                let (calibration, geometry) = (recording_hand(&recording, calibration)?, recording.header.geometry);
+                let side = recording.header.side;
+                let source = recording.play(args.speed, args.repeat).or_runtime()?;
+                let mut plan = Self::with(Input::Ready(Source::File(Box::new(source))), calibration.as_ref(), geometry);
+                plan.side = plan.side.or(side);
+                Ok(plan)
+            }
+        }
+    }
+
+    fn with(input: Input, calibration: Option<&Calibration>, geometry: Option<MasterGeometry>) -> Self {
+        let geometry = geometry.unwrap_or(MasterGeometry::PARADIGMATIC);
+        let finder = calibration.map_or_else(|| PoseFinder::new(geometry), PoseFinder::calibrated);
+        Self { input, finder, side: calibration.map(|calibration| calibration.side) }
+    }
+
+    const fn is_live(&self) -> bool {
+        matches!(self.input, Input::Zenoh)
+    }
+
+    const fn is_recording(&self) -> bool {
+        matches!(self.input, Input::Ready(Source::File(_)))
+    }
+}
+
+/// Checks a recording, and measures its hand if that was not done before.
+fn recording_hand(recording: &RecordingFile, known: Option<Calibration>) -> Result<Option<Calibration>, Failure> {
+    if recording.cut {
+        tracing::warn!("the last line of {} is cut off and left out", recording.name());
+    }
+    if !recording.keypoints {
+        return Ok(known);
+    }
+    let calibration = match known {
+        Some(calibration) => calibration,
+        None => {
+            let found = recording
+                .calibrator
+                .finish()
+                .with_context(|| format!("cannot measure the hand in {}; give --calibration FILE", recording.name()))
+                .or_runtime()?;
+            for line in found.report() {
+                tracing::info!("{line}");
+            }
+            found
+        }
+    };
+    let expected = recording.header.side.unwrap_or(calibration.side);
+    let inspector = recording.calibrator.inspector();
+    if let Some(diagnosis) = inspector.diagnose(expected, false) {
+        return Err(diagnosis).with_context(|| format!("cannot follow the hand in {}", recording.name())).or_runtime();
+    }
+    if let Some(diagnosis) = inspector.diagnose(expected, recording.claims_palm_frame()) {
+        // The fit finds the palm by itself, so this does no harm here; elsewhere it would.
+        tracing::error!("{}: {diagnosis}", recording.name());
+    }
+    Ok(Some(calibration))
+}
+
+/// Streams until the source ends, the time is over or the process is asked to end.
+///
+/// # Errors
+/// [`Failure`]
+pub fn run(args: &RunArgs, shutdown: &Shutdown, terminal: &Terminal) -> Result<Summary, Failure> {
+    let start = Instant::now();
+    let end = args.duration.map(|seconds| start + Duration::from_secs_f64(seconds));
+    let keys = Keys::new(&args.robot.name).or_usage()?;
+    let plan = Plan::new(args)?;
+    let (is_recording, side) = (plan.is_recording(), plan.side);
+    let session = open_session(&args.robot.connect, if plan.is_live() { &args.listen } else { &[] })?;
+    let (recorder, record) = match &args.record {
+        Some(path) => Recorder::create(path, &args.source, side).map(|(a, b)| (Some(a), Some(b))).or_usage()?,
+        None => (None, None),
+    };
+
+    let epoch = random_epoch();
+    let feedback = Arc::new(Feedback::new(epoch));
+    let subscribers = subscribe(&session, &keys, &feedback).or_runtime()?;
+    let publisher = session.publisher(&keys.pose(), Stream::Command).or_runtime()?;
+    let token = session.live_token(&keys.live_operator(epoch)).or_runtime()?;
+    let scene = Scene::operator(keys.name(), side.unwrap_or(HandSide::Right));
+    let viz = Viz::start(args.viewer.clone(), scene).or_runtime()?;
+    let (stream, sender) = PoseStream::start(publisher, epoch, Arc::clone(&feedback)).or_runtime()?;
+    let pipeline = Pipeline::start(Parts {
+        source: open(plan.input, &session, &keys)?,
+        finder: plan.finder,
+        sender,
+        recorder: record,
+        logger: viz.logger(),
+        feedback: Arc::clone(&feedback),
+        // The beginning of a recording should not be lost.
+        wait_for_robot: is_recording,
+        shutdown: shutdown.clone(),
+    })
+    .or_runtime()?;
+
+    let mut display = terminal.display(is_recording);
+    let mut meter = RateMeter::default();
+    while !pipeline.is_finished() {
+        display.show(&Status {
+            name: keys.name().to_owned(),
+            endpoints: args.robot.connect.join(", "),
+            robot: feedback.snapshot(now()),
+            rate: meter.rate(stream.counters().sent.load(Ordering::Relaxed), Instant::now()),
+            progress: pipeline.progress(),
+            lost: recorder.as_ref().map_or(0, Recorder::lost),
+        });
+        let wait = end.map_or(REFRESH, |end| end.saturating_duration_since(Instant::now()).min(REFRESH));
+        if shutdown.wait(wait) || end.is_some_and(|end| Instant::now() >= end) {
+            break;
+        }
+    }
+    shutdown.request();
+    drop(display);
+
+    // In the order of the data: source, network and recording, picture.
+    let (progress, result) = pipeline.join();
+    let sent = stream.counters().sent.load(Ordering::Relaxed);
+    drop((stream, token, subscribers));
+    let recorded = recorder.map(Recorder::finish);
+    if !viz.shutdown(VIEWER_TIMEOUT) {
+        tracing::warn!("the viewer did not take everything in time");
+    }
+    session.close().or_runtime()?;
+    result.or_runtime()?;
+    if progress.ended && !progress.confirmed {
+        tracing::warn!("the robot did not confirm the last pose");
+    }
+    let trips = feedback.round_trips();
+    let round_trip = (trips.count() > 0).then(|| (trips.p50(), trips.p99()));
+    Ok(Summary { sent, progress, round_trip, recorded })
+}
+
+fn open(input: Input, session: &Session, keys: &Keys) -> Result<Source, Failure> {
+    match input {
+        Input::Ready(source) => Ok(source),
+        Input::Zenoh => ZenohSource::subscribe(session, keys).map(Source::Zenoh).or_runtime(),
+    }
+}
