@@ -1,5 +1,6 @@
 //! Wiring: from the command line to running threads, and back to an exit code.
 
+use std::io::IsTerminal as _;
 use std::process::ExitCode;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -59,9 +60,14 @@ pub struct UsageError(pub String);
 fn start_logging(args: &LogArgs) -> anyhow::Result<()> {
     use tracing_subscriber::EnvFilter;
     let filter = args.log.clone().or_else(|| std::env::var("RUST_LOG").ok());
-    let filter = filter.unwrap_or_else(|| "info,zenoh=warn,zenoh_transport=error,re_=warn".to_owned());
+    let filter = filter.unwrap_or_else(|| "info,zenoh=error,re_=warn".to_owned());
     let filter = EnvFilter::try_new(&filter).map_err(|error| UsageError(format!("log filter {filter:?}: {error}")))?;
-    tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).with_target(false).init();
+    tracing_subscriber::fmt()
+        .with_env_filter(filter)
+        .with_writer(std::io::stderr)
+        .with_target(false)
+        .with_ansi(std::io::stderr().is_terminal())
+        .init();
     Ok(())
 }
 

@@ -1,9 +1,219 @@
-//! Offline mapping of whole recordings.
-use crate::cli::RetargetArgs;
-/// Maps a recording.
+//! Offline mapping of whole recordings: `robot retarget`.
+
+mod frames;
+mod output;
+
+use std::fs::File;
+use std::io::{BufReader, BufWriter, Write as _};
+use std::path::Path;
+use std::time::{Duration, Instant};
+
+use anyhow::Context as _;
+use indicatif::{ProgressBar, ProgressStyle};
+use teleop_common::hand::{HandModel, TipFrame};
+use teleop_common::mapping::{FingerSignals, MappingOutput, Retargeter};
+use teleop_common::master::MasterPose;
+use teleop_common::time::MonoTime;
+
+use self::frames::Frames;
+use self::output::{Partial, Row};
+use crate::cli::{RetargetArgs, Switch};
+use crate::config::{Config, ConfigError};
+use crate::control::{ControlParams, Controller, PoseSample};
+use crate::driver::JointState;
+
+/// After this long without a frame the hand stands still, whatever it did before.
+const SETTLED: Duration = Duration::from_secs(3);
+
+/// Maps the recording frame by frame.
 ///
 /// # Errors
-/// Not yet.
+/// Input that cannot be used (with its line), or a file that cannot be written. The output file then does not appear.
 pub fn run(args: &RetargetArgs) -> anyhow::Result<()> {
-    anyhow::bail!("{}", args.input.display())
+    let config = Config::load(args.hand.config.as_deref(), &args.hand.overrides())?;
+    let hand = args.hand.source().load(&config)?;
+    let mut retargeter = Retargeter::new(hand.clone(), config.mapping.clone()).map_err(ConfigError::from)?;
+    let mut live = match args.conditioning {
+        Switch::On => Some(Live::new(&hand, &config)?),
+        Switch::Off => None,
+    };
+    let started = Instant::now();
+    let frames = Frames::open(&args.input, args.calibration.as_deref(), hand.side)?;
+    let mut output = Partial::create(&args.output)?;
+    let bar = progress(&args.input);
+    let mut stats = Stats::default();
+
+    // One frame behind: what the live robot commands for a frame is known when the next one comes.
+    let mut waiting: Option<(f64, MasterPose, MappingOutput)> = None;
+    for frame in frames {
+        let (t, pose, read) = frame?;
+        let begun = Instant::now();
+        let mapped = retargeter.map(&pose);
+        stats.record(begun.elapsed());
+        if let Some((last, before, mapping)) = waiting.replace((t, pose, mapped)) {
+            finish(&mut output, &hand, &mut live, (last, &before, mapping), t)?;
+            stats.period = t - last;
+        }
+        bar.set_position(read);
+    }
+    if let Some((last, pose, mapping)) = waiting {
+        finish(&mut output, &hand, &mut live, (last, &pose, mapping), last + stats.period)?;
+    }
+    output.complete()?;
+    bar.finish_and_clear();
+    tracing::info!(
+        "{} frames to {} in {:.2} s; mapping {} per frame (median)",
+        stats.steps.len(),
+        args.output.display(),
+        started.elapsed().as_secs_f64(),
+        stats.quantile(0.5).map_or_else(|| "none".to_owned(), |us| format!("{us:.1} us")),
+    );
+    if let Some(path) = &args.stats {
+        stats.write(path)?;
+    }
+    Ok(())
+}
+
+/// Writes one frame's row; with conditioning, after the live loop ran until `next`.
+fn finish(
+    output: &mut Partial,
+    hand: &HandModel,
+    live: &mut Option<Live>,
+    (t, pose, mut mapping): (f64, &MasterPose, MappingOutput),
+    next: f64,
+) -> anyhow::Result<()> {
+    if let Some(live) = live {
+        mapping = live.run(t, pose, next, hand, &mapping);
+    }
+    output.write(&Row::new(t, pose, &mapping))
+}
+
+/// The live robot in virtual time, with a hand that does exactly what it is told.
+struct Live {
+    controller: Controller,
+    params: ControlParams,
+    state: JointState,
+    tick: u64,
+    start: Option<f64>,
+    sequence: u64,
+}
+
+impl Live {
+    fn new(hand: &HandModel, config: &Config) -> Result<Self, ConfigError> {
+        let still = teleop_common::hand::JointVector::zeros(hand.joints.len());
+        Ok(Self {
+            controller: Controller::new(hand.clone(), config.mapping.clone(), config.control)?,
+            params: config.control,
+            state: JointState { q: hand.home(), dq: still, tau: still },
+            tick: 0,
+            start: None,
+            sequence: 0,
+        })
+    }
+
+    /// The ticks from `t` (s), when `pose` arrives, to before `next`; returns `mapping` with the last command in it.
+    fn run(
+        &mut self,
+        t: f64,
+        pose: &MasterPose,
+        next: f64,
+        hand: &HandModel,
+        mapping: &MappingOutput,
+    ) -> MappingOutput {
+        let start = *self.start.get_or_insert(t);
+        let at = |seconds: f64| MonoTime(((seconds - start) * 1e9).max(0.0) as u64);
+        self.sequence += 1;
+        let sample = PoseSample {
+            pose: *pose,
+            epoch: 1,
+            sequence: self.sequence,
+            captured_remote: at(t),
+            captured: at(t),
+            received: at(t),
+        };
+        let end = at(next);
+        loop {
+            let now = MonoTime((self.tick as f64 * 1e9 / self.params.rate) as u64);
+            if now >= end {
+                break;
+            }
+            self.tick += 1;
+            if now.since(sample.received) > self.params.hold_after + SETTLED {
+                // The rest of a long gap changes nothing.
+                self.tick = ((end.0 as f64) * 1e-9 * self.params.rate) as u64;
+                continue;
+            }
+            let record = self.controller.tick(now, Some(&sample), &self.state);
+            self.state.q = record.command.q;
+            self.state.dq = record.command.dq;
+        }
+        commanded(hand, mapping, &self.state)
+    }
+}
+
+/// The mapping's signals with the posture that was commanded in place of the one that was mapped.
+fn commanded(hand: &HandModel, mapping: &MappingOutput, state: &JointState) -> MappingOutput {
+    let mut signals = Vec::with_capacity(mapping.fingers().len());
+    for (chain, mapped) in hand.fingers.iter().zip(mapping.fingers()) {
+        let (own, joint) = (chain.select(&state.q), chain.select(&mapping.q_joint));
+        let p = chain.tip(&own, TipFrame::Pole);
+        signals.push(FingerSignals {
+            p,
+            e_q: own.iter().zip(&joint).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt(),
+            e_c: (mapped.p_cartesian - p).norm(),
+            ..*mapped
+        });
+    }
+    MappingOutput::new(mapping.q_joint, state.q, &signals)
+}
+
+/// Durations of the mapping steps.
+#[derive(Default)]
+struct Stats {
+    // ns
+    steps: Vec<u32>,
+    period: f64,
+}
+
+impl Stats {
+    fn record(&mut self, step: Duration) {
+        self.steps.push(u32::try_from(step.as_nanos()).unwrap_or(u32::MAX));
+    }
+
+    /// us
+    fn quantile(&self, p: f64) -> Option<f64> {
+        let mut sorted = self.steps.clone();
+        let last = sorted.len().checked_sub(1)?;
+        let rank = ((last as f64) * p).round() as usize;
+        Some(f64::from(*sorted.select_nth_unstable(rank.min(last)).1) * 1e-3)
+    }
+
+    fn write(&self, path: &Path) -> anyhow::Result<()> {
+        let seconds = self.steps.iter().map(|&step| f64::from(step) * 1e-9).sum::<f64>();
+        let text = serde_json::json!({
+            "frames": self.steps.len(),
+            "seconds": seconds,
+            "step_us": { "p50": self.quantile(0.5), "p99": self.quantile(0.99), "max": self.quantile(1.0) },
+        });
+        let file = File::create(path).with_context(|| format!("cannot write {}", path.display()))?;
+        let mut file = BufWriter::new(file);
+        writeln!(file, "{text}").and_then(|()| file.flush()).with_context(|| format!("cannot write {}", path.display()))
+    }
+}
+
+/// A bar over the bytes of the input; nothing where nobody would see it.
+fn progress(input: &Path) -> ProgressBar {
+    let bytes = std::fs::metadata(input).map_or(0, |meta| meta.len());
+    let bar = ProgressBar::new(bytes);
+    if let Ok(style) =
+        ProgressStyle::with_template("retarget {wide_bar} {percent:>3} % {binary_bytes_per_sec}  {eta} left")
+    {
+        bar.set_style(style);
+    }
+    bar
+}
+
+fn open(path: &Path) -> anyhow::Result<BufReader<File>> {
+    let file = File::open(path).with_context(|| format!("cannot open {}", path.display()))?;
+    Ok(BufReader::with_capacity(1 << 16, file))
 }

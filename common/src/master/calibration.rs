@@ -207,9 +207,28 @@ impl Calibrator {
                 }
             }
         }
+        Ok(self.calibration(side, geometry, spread))
+    }
+
+    /// The medians over whatever was seen, for a recording that cannot be taken again: however short, still or
+    /// unsteady. A side that is not clear is taken to be `side`.
+    ///
+    /// # Errors
+    /// No frames, or the medians are not those of a hand.
+    pub fn best_effort(&self, side: HandSide) -> Result<Calibration, CalibrationError> {
+        if self.kept.is_empty() {
+            return Err(CalibrationError::TooFewFrames { frames: self.seen, rejected: self.rejected });
+        }
+        let side = if let SideVerdict::Hand(seen) = self.inspector.side() { seen } else { side };
+        let (geometry, spread) = self.medians(side);
+        geometry.validate()?;
+        Ok(self.calibration(side, geometry, spread))
+    }
+
+    fn calibration(&self, side: HandSide, geometry: MasterGeometry, spread: Spread) -> Calibration {
         let mut fitter = Fitter::new(geometry, side);
         let (residual, _) = median_and_deviation(self.kept.iter().map(|frame| fitter.fit(frame).residual()));
-        Ok(Calibration { side, frames: self.seen, rejected: self.rejected, residual, geometry, spread })
+        Calibration { side, frames: self.seen, rejected: self.rejected, residual, geometry, spread }
     }
 
     /// Largest range of a fingertip coordinate in the palm frame between the 5th and 95th percentile, m.

@@ -1,0 +1,136 @@
+//! The frames of a recording as master poses.
+
+use std::cell::Cell;
+use std::fs::File;
+use std::io::{BufRead, BufReader, Read};
+use std::path::{Path, PathBuf};
+use std::rc::Rc;
+
+use anyhow::Context as _;
+use teleop_common::hand::HandSide;
+use teleop_common::master::{Calibration, Calibrator, Fitter, MasterGeometry, MasterPose};
+use teleop_common::recording::{FrameData, LastLine, RecordingReader};
+
+use crate::app::UsageError;
+
+/// Reads a recording and fits a hand to its keypoints.
+pub(super) struct Frames {
+    path: PathBuf,
+    reader: RecordingReader<Counted>,
+    read: Rc<Cell<u64>>,
+    geometry: MasterGeometry,
+    fitter: Option<Fitter>,
+}
+
+impl Frames {
+    /// Opens `path`. If it holds keypoints and no calibration is given, measures the hand over the whole file first.
+    pub(super) fn open(path: &Path, calibration: Option<&Path>, side: HandSide) -> anyhow::Result<Self> {
+        let known = calibration.map(load_calibration).transpose()?;
+        let (reader, read) = read(path)?;
+        let mut geometry = reader.header().geometry.unwrap_or(MasterGeometry::PARADIGMATIC);
+        let mut fitter = None;
+        if let Some(known) = known {
+            geometry = known.geometry;
+            fitter = Some(Fitter::new(known.geometry, known.side));
+        } else if matches!(first(path)?, Some(FrameData::Keypoints(_))) {
+            let measured = measure(path, side)?;
+            for line in measured.report() {
+                tracing::info!("{line}");
+            }
+            geometry = measured.geometry;
+            fitter = Some(Fitter::new(measured.geometry, measured.side));
+        }
+        if let Some(error) = geometry.validate().err() {
+            return Err(UsageError(format!("{}: {error}", path.display())).into());
+        }
+        Ok(Self { path: path.to_owned(), reader, read, geometry, fitter })
+    }
+}
+
+impl Iterator for Frames {
+    /// Time (s), pose, and bytes read so far.
+    type Item = anyhow::Result<(f64, MasterPose, u64)>;
+
+    fn next(&mut self) -> Option<Self::Item> {
+        let frame = match self.reader.next()? {
+            Ok(frame) => frame,
+            Err(error) => return Some(Err(UsageError(format!("{}: {error}", self.path.display())).into())),
+        };
+        let pose = match (&frame.data, &mut self.fitter) {
+            (FrameData::Joints(q), _) => MasterPose { q: *q, geometry: self.geometry },
+            (FrameData::Keypoints(keypoints), Some(fitter)) => fitter.pose(keypoints),
+            (FrameData::Keypoints(_), None) => {
+                let (path, line) = (self.path.display(), self.reader.line());
+                let text = format!(
+                    "{path}: line {line} has keypoints, the lines before have joint angles: \
+                     give the hand's sizes with --calibration, or split the file"
+                );
+                return Some(Err(UsageError(text).into()));
+            }
+        };
+        Some(Ok((frame.t, pose, self.read.get())))
+    }
+}
+
+fn load_calibration(path: &Path) -> anyhow::Result<Calibration> {
+    let text = std::fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))?;
+    Calibration::from_text(&text).map_err(|error| UsageError(format!("{}: {error}", path.display())).into())
+}
+
+fn first(path: &Path) -> anyhow::Result<Option<FrameData>> {
+    let (mut reader, _) = read(path)?;
+    // A bad first line is told when its turn comes.
+    Ok(reader.next().and_then(Result::ok).map(|frame| frame.data))
+}
+
+/// The person's hand out of the whole recording.
+fn measure(path: &Path, side: HandSide) -> anyhow::Result<Calibration> {
+    let mut calibrator = Calibrator::default();
+    for frame in read(path)?.0.map_while(Result::ok) {
+        if let FrameData::Keypoints(keypoints) = &frame.data {
+            calibrator.push(keypoints);
+        }
+    }
+    match calibrator.finish() {
+        Ok(calibration) => Ok(calibration),
+        Err(error) => {
+            let rough = calibrator.best_effort(side);
+            let rough = rough.map_err(|error| UsageError(format!("{}: {error}", path.display())))?;
+            tracing::warn!("the hand's sizes are a rough estimate: {error}");
+            Ok(rough)
+        }
+    }
+}
+
+fn read(path: &Path) -> anyhow::Result<(RecordingReader<Counted>, Rc<Cell<u64>>)> {
+    let read = Rc::new(Cell::new(0));
+    let input = Counted { inner: super::open(path)?, read: Rc::clone(&read) };
+    let reader = RecordingReader::new(input, LastLine::Whole)
+        .map_err(|error| UsageError(format!("{}: {error}", path.display())))?;
+    Ok((reader, read))
+}
+
+/// Counts the bytes that go through.
+struct Counted {
+    inner: BufReader<File>,
+    read: Rc<Cell<u64>>,
+}
+
+impl Read for Counted {
+    fn read(&mut self, buffer: &mut [u8]) -> std::io::Result<usize> {
+        let count = self.inner.read(buffer)?;
+        self.read.set(self.read.get() + count as u64);
+        Ok(count)
+    }
+}
+
+impl BufRead for Counted {
+    fn fill_buf(&mut self) -> std::io::Result<&[u8]> {
+        self.inner.fill_buf()
+    }
+
+    fn consume(&mut self, amount: usize) {
+        self.read.set(self.read.get() + amount as u64);
+        self.inner.consume(amount);
+    }
+}
