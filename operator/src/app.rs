@@ -91,7 +91,9 @@ pub fn main(cli: Cli) -> Result<(), Failure> {
         .or_runtime()?;
     watch_signals(&runtime, &shutdown).context("cannot watch for signals").or_runtime()?;
     let result = match command {
-        Command::Run(args) => run(&args, &shutdown, &terminal).map(|summary| say(&summary.to_string())),
+        Command::Run(args) => {
+            run(&args, &shutdown, &terminal).map(|summary| say(&summary.to_string()).unwrap_or_default())
+        }
         Command::Calibrate(args) => calibrate::calibrate(&args, &shutdown),
         Command::Watch(args) => watch_robot(&args, &shutdown),
         Command::Gestures => {
@@ -142,7 +144,7 @@ fn watch_signals(runtime: &tokio::runtime::Runtime, shutdown: &Shutdown) -> std:
 
 fn gestures() {
     for gesture in Gesture::ALL {
-        say(&format!("{gesture:<18} {:>6.1} s  {}", gesture.duration(), gesture.description()));
+        say(&format!("{gesture:<18} {:>6.1} s  {}", gesture.duration(), gesture.description())).ok();
     }
 }
 

@@ -36,9 +36,9 @@ pub fn calibrate(args: &CalibrateArgs, shutdown: &Shutdown) -> Result<(), Failur
         calibrator.finish().with_context(|| format!("cannot calibrate from {:?}", args.source)).or_runtime()?;
     save(&calibration, &args.output).or_runtime()?;
     for line in calibration.report() {
-        say(&line);
+        say(&line).ok();
     }
-    say(&format!("saved to {}", args.output.display()));
+    say(&format!("saved to {}", args.output.display())).ok();
     Ok(())
 }
 
@@ -68,7 +68,7 @@ fn live(args: &CalibrateArgs, shutdown: &Shutdown) -> Result<Calibrator, Failure
     let session = open_session(&[], &args.listen)?;
     let mut source = Source::Zenoh(ZenohSource::subscribe(&session, &keys).or_runtime()?);
     let time = args.seconds.map_or(LIVE, Duration::from_secs_f64);
-    say(&format!("waiting for keypoints on {} at {}", keys.hand_input(), args.listen.join(", ")));
+    say(&format!("waiting for keypoints on {} at {}", keys.hand_input(), args.listen.join(", "))).ok();
     let mut calibrator = Calibrator::default();
     let began = Instant::now();
     let mut first = None;
@@ -79,7 +79,7 @@ fn live(args: &CalibrateArgs, shutdown: &Shutdown) -> Result<Calibrator, Failure
                 FrameData::Keypoints(keypoints) => {
                     calibrator.push(keypoints);
                     if first.is_none() {
-                        say(&format!("open and close the hand for {:.0} s", time.as_secs_f64()));
+                        say(&format!("open and close the hand for {:.0} s", time.as_secs_f64())).ok();
                     }
                     let since = first.get_or_insert_with(Instant::now).elapsed();
                     if since >= time {
@@ -91,7 +91,7 @@ fn live(args: &CalibrateArgs, shutdown: &Shutdown) -> Result<Calibrator, Failure
                             SideVerdict::Hand(side) => side.name(),
                             SideVerdict::Undecided => "?",
                         };
-                        say(&format!("calibrating {:.0} %, hand: {side}", 100.0 * since.div_duration_f64(time)));
+                        say(&format!("calibrating {:.0} %, hand: {side}", 100.0 * since.div_duration_f64(time))).ok();
                     }
                 }
                 FrameData::Joints(_) => {

@@ -12,7 +12,7 @@ pub const INPUT_ENDPOINT: &str = "tcp/127.0.0.1:7448";
 
 const EXAMPLES: &str = "\
 Examples:
-  operator                                       stream the gesture tour to the robot on this machine
+  operator                                       the gesture tour, to the robot on this machine
   operator --source tap_middle --rate 200        one gesture, 200 poses a second
   operator --source hand.csv --loop              a recording, again and again
   operator --source zenoh --calibration me.toml  hand data from any program, see below
@@ -21,8 +21,8 @@ Examples:
   operator watch --json --duration 5             what the robot does, as JSON lines
   operator gestures                              what --source knows
 
-Any program can feed a hand with `--source zenoh`: put JSON on the Zenoh key allegro/v1/<name>/in/hand, connected to
-tcp/127.0.0.1:7448, one message per frame, either of
+Any program can feed a hand with `--source zenoh`: connect it to tcp/127.0.0.1:7448 and put JSON on
+the Zenoh key allegro/v1/<name>/in/hand, one message per frame, either of
   {\"t\": 1.25, \"q\": [20 joint angles, rad: thumb, index, middle, ring, little, four each]}
   {\"t\": 1.25, \"keypoints\": [[x, y, z], ... 21 points, m, in the order of MediaPipe]}
 

@@ -54,7 +54,7 @@ impl std::fmt::Display for Summary {
             Some((p50, p99)) => {
                 write!(f, ", round trip {:.1} ms p50, {:.1} ms p99", 1e3 * p50.as_secs_f64(), 1e3 * p99.as_secs_f64())?;
             }
-            None => write!(f, ", no answer from the robot")?,
+            None => write!(f, ", no echo from the robot")?,
         }
         write!(f, ", {} skipped", progress.skipped)?;
         if progress.bad > 0 {
@@ -135,9 +135,8 @@ fn recording_hand(recording: &RecordingFile, known: Option<Calibration>) -> Resu
                 .finish()
                 .with_context(|| format!("cannot measure the hand in {}; give --calibration FILE", recording.name()))
                 .or_runtime()?;
-            for line in found.report() {
-                tracing::info!("{line}");
-            }
+            let report: Vec<String> = found.report().into_iter().take(2).collect();
+            tracing::info!("measured in {}: {}", recording.name(), report.join(", "));
             found
         }
     };

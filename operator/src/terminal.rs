@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use indicatif::{MultiProgress, ProgressBar, ProgressStyle};
 use teleop_common::mode::Mode;
 
-use crate::feedback::Snapshot;
+use crate::feedback::{Reason, Snapshot};
 use crate::pipeline::Progress;
 
 /// Status lines of a program that is not watched on a terminal.
@@ -75,6 +75,7 @@ pub fn status_line(status: &Status) -> String {
         part(format!("rtt {:.1} ms", round_trip.as_secs_f64() * 1e3));
     }
     if robot.connected
+        && robot.reason != Some(Reason::OtherOperator)
         && let Some(health) = robot.health.as_ref().filter(|health| health.poses_accepted > 0)
     {
         part(format!("pose age at robot {:.1} ms (p99)", health.age_ms.p99));
@@ -221,7 +222,8 @@ impl Display {
         if due {
             let progress =
                 status.progress.fraction.map_or_else(String::new, |done| format!("  |  {:.0} %", 100.0 * done));
-            say(&format!("{}{progress}", status_line(status)));
+            // A reader that went away is no reason to stop streaming.
+            say(&format!("{}{progress}", status_line(status))).ok();
             self.last = Some((Instant::now(), status.clone()));
         }
     }
@@ -251,9 +253,12 @@ pub fn chain(error: &dyn std::error::Error) -> String {
     line
 }
 
-/// Prints a line for people. A reader that went away is no reason to fail.
-pub fn say(line: &str) {
-    writeln!(std::io::stdout(), "{line}").ok();
+/// Prints a line on standard output.
+///
+/// # Errors
+/// Nobody reads it any more.
+pub fn say(line: &str) -> std::io::Result<()> {
+    writeln!(std::io::stdout(), "{line}")
 }
 
 /// Writes log lines to stderr around the status line.
@@ -317,7 +322,7 @@ mod tests {
                 poses_accepted: 5,
                 rejected: [0; 8],
                 holds: 0,
-                age_ms: Quantiles { p50: 1.0, p99: 3.14, max: 4.0 },
+                age_ms: Quantiles { p50: 1.0, p99: 3.12, max: 4.0 },
                 telemetry_dropped: 0,
                 rate_hz: 333.0,
             };

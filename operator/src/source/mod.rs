@@ -35,6 +35,7 @@ pub struct SourceFrame {
 
 /// What a source has to say.
 #[derive(Clone, Copy, Debug, PartialEq)]
+#[expect(clippy::large_enum_variant, reason = "lives on the stack for one frame; a box would allocate for each")]
 pub enum Poll {
     /// A frame, due now.
     Frame(SourceFrame),
