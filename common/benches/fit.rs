@@ -1,13 +1,15 @@
 //! Time of one fit of a whole hand: synthetic keypoints of the gesture tour with tracker noise, and the same
 //! without a last posture; then the real recording, where it is at hand. `cargo bench -p teleop-common --bench fit`.
-#![allow(clippy::print_stdout, clippy::unwrap_used, reason = "a bench reports on the terminal")]
+#![allow(clippy::print_stdout, clippy::unwrap_used, missing_docs, reason = "a bench reports on the terminal")]
+
+mod report;
 
 use std::fs::File;
 use std::hint::black_box;
 use std::io::BufReader;
-use std::time::Instant;
 
 use nalgebra::Vector3;
+use report::report;
 use teleop_common::hand::{Finger, HandSide};
 use teleop_common::master::{Calibrator, Fitter, Gesture, Keypoints, MasterGeometry};
 use teleop_common::recording::{FrameData, LastLine, RecordingReader};
@@ -44,27 +46,6 @@ fn main() {
     report("recording", &repeated, |frame| {
         black_box(fitter.fit(frame));
     });
-}
-
-fn report(name: &str, frames: &[Keypoints], mut run: impl FnMut(&Keypoints)) {
-    for frame in frames.iter().take(1000) {
-        run(black_box(frame));
-    }
-    let start = Instant::now();
-    let mut times: Vec<u64> = frames
-        .iter()
-        .map(|frame| {
-            let start = Instant::now();
-            run(black_box(frame));
-            u64::try_from(start.elapsed().as_nanos()).unwrap_or(u64::MAX)
-        })
-        .collect();
-    let total = start.elapsed().as_secs_f64();
-    times.sort_unstable();
-    let us = |index: usize| times[index.min(times.len() - 1)] as f64 * 1e-3;
-    let (p50, p99, max) = (us(times.len() / 2), us(times.len() * 99 / 100), us(times.len()));
-    let rate = times.len() as f64 / total;
-    println!("{name:12} p50 {p50:7.2} us  p99 {p99:7.2} us  max {max:7.2} us  {rate:9.0} hands/s");
 }
 
 fn frames() -> Vec<Keypoints> {
