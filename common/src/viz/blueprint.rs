@@ -59,9 +59,9 @@ fn layout() -> Node {
     let human = space("human hand", "operator/hand", Eye { target: [0.026, 0.080, 0.020], distance: 0.275 });
     let robot = space("robot hand", "robot/hand", Eye { target: [0.010, 0.020, 0.030], distance: 0.46 });
     let joints = ["thumb", "index", "middle", "ring"]
-        .map(|finger| plot(finger, &[&format!("/robot/joints/{finger}")], None))
+        .map(|finger| plot(&format!("{finger} [rad]"), &[&format!("/robot/joints/{finger}")], None))
         .into_iter()
-        .chain([plot("speed", &["/robot/joints/speed"], None)]);
+        .chain([plot("speed [rad/s]", &["/robot/joints/speed"], None)]);
     let bottom = Node::Row(vec![
         (1.0, plot("latency [ms]", &["/operator/network", "/robot/timing"], None)),
         (1.3, view("TextLog", "log", "/", &["/operator/log", "/robot/log"])),
@@ -71,7 +71,7 @@ fn layout() -> Node {
             1.25,
             Node::Column(vec![
                 (4.2, Node::Row(vec![(1.0, human), (1.0, robot)])),
-                (0.85, view("StateTimeline", "mode", "/", &["/robot/mode", "/operator/connection"])),
+                (0.85, lanes("mode", &["/robot/mode", "/operator/connection"])),
                 (1.35, bottom),
             ]),
         ),
@@ -136,7 +136,7 @@ fn space(name: &str, root: &str, eye: Eye) -> Node {
         .with_position(position)
         .with_look_target(eye.target)
         .with_eye_up([0.0, 1.0, 0.0]);
-    let background = Background::new(BackgroundKind::SolidColor).with_color(palette::rgb(20, 22, 27));
+    let background = Background::new(BackgroundKind::SolidColor).with_color(palette::rgb(44, 48, 57));
     let origin = format!("/{root}");
     Node::View(
         bare("3D", name, &origin, &["$origin"])
@@ -148,19 +148,27 @@ fn space(name: &str, root: &str, eye: Eye) -> Node {
 
 /// A plot of the last [`WINDOW`].
 fn plot(name: &str, contents: &[&str], range: Option<[f64; 2]>) -> Node {
+    let view = windowed(bare("TimeSeries", name, "/", contents))
+        .with("PlotLegend", &PlotLegend::new().with_corner(Corner2D::LeftTop));
+    Node::View(match range {
+        Some(range) => view.with("ScalarAxis", &ScalarAxis::new().with_range(range)),
+        None => view,
+    })
+}
+
+/// Coloured lanes of states.
+fn lanes(name: &str, contents: &[&str]) -> Node {
+    Node::View(windowed(bare("StateTimeline", name, "/", contents)))
+}
+
+fn windowed(view: View) -> View {
     let window = TimeRange {
         start: TimeRangeBoundary::CursorRelative(TimeInt(-WINDOW)),
         end: TimeRangeBoundary::CursorRelative(TimeInt(0)),
     };
     let query = VisibleTimeRange(datatypes::VisibleTimeRange { timeline: TIMELINE.into(), range: window.clone() });
-    let mut view = bare("TimeSeries", name, "/", contents)
-        .with("TimeAxis", &TimeAxis::new().with_view_range(window))
+    view.with("TimeAxis", &TimeAxis::new().with_view_range(window))
         .with("VisibleTimeRanges", &VisibleTimeRanges::new([query]))
-        .with("PlotLegend", &PlotLegend::new().with_corner(Corner2D::LeftTop));
-    if let Some(range) = range {
-        view = view.with("ScalarAxis", &ScalarAxis::new().with_range(range));
-    }
-    Node::View(view)
 }
 
 /// A node that has been written.

@@ -140,19 +140,21 @@ impl Pace {
     }
 }
 
-/// A state lane, written when the state changes.
+/// A state lane, written when the state changes and every second, so that any window of time has it.
 struct Lane {
     path: &'static str,
     state: Option<&'static str>,
+    repeat: Pace,
 }
 
 impl Lane {
     const fn new(path: &'static str) -> Self {
-        Self { path, state: None }
+        Self { path, state: None, repeat: Pace::new(1_000_000_000) }
     }
 
-    fn set(&mut self, state: &'static str, stream: &RecordingStream) -> RecordingStreamResult<()> {
-        if self.state == Some(state) {
+    fn set(&mut self, time: i64, state: &'static str, stream: &RecordingStream) -> RecordingStreamResult<()> {
+        let due = self.repeat.due(time);
+        if self.state == Some(state) && !due {
             return Ok(());
         }
         self.state = Some(state);

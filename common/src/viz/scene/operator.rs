@@ -1,5 +1,8 @@
 use nalgebra::Vector3;
-use rerun::{Capsules3D, Ellipsoids3D, FillMode, LineStrips3D, RecordingStream, RecordingStreamResult};
+use rerun::{
+    AsComponents, Capsules3D, Ellipsoids3D, FillMode, LineStrips3D, RecordingStream, RecordingStreamResult,
+    StateConfiguration,
+};
 
 use super::series::{Curve, Series};
 use super::space::{along, from_master, point, quaternion};
@@ -20,6 +23,9 @@ const RADII: [[f64; 3]; 5] = [
 ];
 const METACARPAL_RADIUS: f64 = 0.0088;
 
+const CONNECTED: &str = "connected";
+const ALONE: &str = "not connected";
+
 /// The human hand and the operator's plots.
 pub(super) struct Drawing<'a> {
     side: HandSide,
@@ -39,10 +45,14 @@ impl<'a> Drawing<'a> {
     pub(super) fn new(side: HandSide, opposing: &'a [Finger], stream: &RecordingStream) -> RecordingStreamResult<Self> {
         let distances: Vec<Curve> = opposing
             .iter()
-            .map(|finger| Curve::thin(format!("human {} [mm]", finger.name()), palette::finger(*finger)))
+            .map(|finger| Curve::thin(format!("human {}", finger.name()), palette::finger(*finger)))
             .collect();
         let network =
-            [Curve::new("round trip [ms]", palette::joint(0)), Curve::new("keypoint residual [mm]", palette::joint(3))];
+            [Curve::new("round trip", palette::joint(0)), Curve::new("keypoint residual [mm]", palette::joint(3))];
+        let style = StateConfiguration::new()
+            .with_values([CONNECTED, ALONE])
+            .with_colors([palette::finger(Finger::Index), palette::FAINT]);
+        stream.log_static("operator/connection", &style)?;
         Ok(Self {
             side,
             opposing,
@@ -58,8 +68,8 @@ impl<'a> Drawing<'a> {
 
     pub(super) fn draw(&mut self, frame: &OperatorFrame, stream: &RecordingStream) -> RecordingStreamResult<()> {
         stream.set_timestamp_nanos_since_epoch(TIMELINE, frame.time);
-        let connection = if frame.round_trip.is_some() { "connected" } else { "not connected" };
-        self.connection.set(connection, stream)?;
+        let connection = if frame.round_trip.is_some() { CONNECTED } else { ALONE };
+        self.connection.set(frame.time, connection, stream)?;
         if self.plots.due(frame.time) {
             let thumb = frame.pose.tip(Finger::Thumb);
             let delta = self.opposing.iter().map(|finger| (frame.pose.tip(*finger) - thumb).norm() * 1e3);
@@ -69,8 +79,7 @@ impl<'a> Drawing<'a> {
         }
         if self.space.due(frame.time) {
             self.hand(frame, stream)?;
-            self.spheres(frame, stream)?;
-            self.distances(frame, stream)?;
+            self.neighbourhood(frame, stream)?;
         }
         Ok(())
     }
@@ -96,7 +105,7 @@ impl<'a> Drawing<'a> {
             }
         }
         let moved = Capsules3D::update_fields().with_translations(places).with_quaternions(turns);
-        stream.log("operator/hand/fingers", &moved)
+        stream.log("operator/hand", &moved)
     }
 
     /// The parts of the hand that change with the person only: lengths, radii, the palm.
@@ -116,7 +125,7 @@ impl<'a> Drawing<'a> {
         }
         let fingers =
             Capsules3D::from_lengths_and_radii(lengths, radii).with_colors(colors).with_fill_mode(FillMode::Solid);
-        stream.log_static("operator/hand/fingers", &fingers)?;
+        stream.log_static("operator/hand", &fingers)?;
 
         let mut places = Vec::new();
         let mut turns = Vec::new();
@@ -148,8 +157,8 @@ impl<'a> Drawing<'a> {
         stream.log_static("operator/hand/palm", &palm)
     }
 
-    /// The spheres r1 and r2 around the thumb tip.
-    fn spheres(&mut self, frame: &OperatorFrame, stream: &RecordingStream) -> RecordingStreamResult<()> {
+    /// The spheres r1 and r2 around the thumb tip, and lines to the fingertips inside r2, in the finger's colour by k.
+    fn neighbourhood(&mut self, frame: &OperatorFrame, stream: &RecordingStream) -> RecordingStreamResult<()> {
         let radii = [frame.r1, frame.r2];
         if self.radii != Some(radii) {
             self.radii = Some(radii);
@@ -159,21 +168,18 @@ impl<'a> Drawing<'a> {
                 .with_fill_mode(FillMode::MajorWireframe);
             stream.log_static("operator/hand/spheres", &spheres)?;
         }
-        let tip = point(&from_master(&frame.pose.tip(Finger::Thumb), self.side));
-        stream.log("operator/hand/spheres", &Ellipsoids3D::update_fields().with_centers([tip, tip]))
-    }
-
-    /// Lines from the thumb tip to the fingertips inside r2, in the finger's colour by k.
-    fn distances(&self, frame: &OperatorFrame, stream: &RecordingStream) -> RecordingStreamResult<()> {
-        let gain = Gain { r1: frame.r1, r2: frame.r2, shape: GainShape::Cosine };
         let thumb = frame.pose.tip(Finger::Thumb);
+        let center = point(&from_master(&thumb, self.side));
+        let spheres = Ellipsoids3D::update_fields().with_centers([center, center]);
+
+        let gain = Gain { r1: frame.r1, r2: frame.r2, shape: GainShape::Cosine };
         let (mut strips, mut colors, mut labels) = (Vec::new(), Vec::new(), Vec::new());
         for &finger in self.opposing {
             let tip = frame.pose.tip(finger);
             let delta = (tip - thumb).norm();
             let k = gain.at(delta);
             if k > 0.0 {
-                strips.push([point(&from_master(&thumb, self.side)), point(&from_master(&tip, self.side))]);
+                strips.push([center, point(&from_master(&tip, self.side))]);
                 colors.push(palette::fade(palette::finger(finger), k));
                 labels.push(format!("{:.0} mm", delta * 1e3));
             }
@@ -183,6 +189,6 @@ impl<'a> Drawing<'a> {
             .with_labels(labels)
             .with_show_labels(true)
             .with_radii([0.0006]);
-        stream.log("operator/hand/distance", &lines)
+        stream.log("operator/hand/spheres", &[&spheres as &dyn AsComponents, &lines])
     }
 }

@@ -1,14 +1,13 @@
 use nalgebra::{Isometry3, Matrix3, UnitQuaternion, Vector3};
 use rerun::{
-    Boxes3D, Color, Cylinders3D, Ellipsoids3D, FillMode, LineStrips3D, Points3D, RecordingStream,
+    AsComponents, Boxes3D, Color, Cylinders3D, Ellipsoids3D, FillMode, LineStrips3D, Points3D, RecordingStream,
     RecordingStreamResult, StateConfiguration,
 };
 
 use super::series::{Curve, Series};
 use super::space::{from_palm, point, quaternion};
 use super::{Lane, PLOT_PERIOD, Pace, SPACE_PERIOD};
-use crate::hand::{HandModel, MAX_FINGER_JOINTS, Shape};
-use crate::mapping::MappingOutput;
+use crate::hand::{Finger, FingerChain, HandModel, JointVector, Shape, TipFrame};
 use crate::mode::Mode;
 use crate::viz::frame::RobotFrame;
 use crate::viz::{TIMELINE, palette};
@@ -39,19 +38,17 @@ pub(super) struct Drawing<'a> {
 
 impl<'a> Drawing<'a> {
     pub(super) fn new(hand: &'a HandModel, stream: &RecordingStream) -> RecordingStreamResult<Self> {
-        let per_finger = |what: &str, unit: &str| -> Vec<Curve> {
-            let name = |finger: &str| format!("{what} {finger}{unit}");
+        let per_finger = |what: &str| -> Vec<Curve> {
+            let name = |finger: &str| format!("{what} {finger}");
             hand.fingers.iter().map(|f| Curve::new(name(f.finger.name()), palette::finger(f.finger))).collect()
         };
-        let distances: Vec<Curve> = per_finger("robot", " [mm]").into_iter().skip(1).collect();
+        let distances: Vec<Curve> = per_finger("robot").into_iter().skip(1).collect();
         let mut joints = Vec::with_capacity(hand.fingers.len());
         for finger in &hand.fingers {
-            let name = |slot: usize, what: &str| format!("q{slot} {what} [rad]");
             let slots = 0..finger.joints.len();
-            let measured = slots.clone().map(|slot| Curve::new(name(slot, "measured"), palette::joint(slot)));
-            let commanded =
-                slots.map(|slot| Curve::thin(name(slot, "commanded"), palette::fade(palette::joint(slot), 0.55)));
-            let curves: Vec<Curve> = commanded.chain(measured).collect();
+            let measured = slots.clone().map(|slot| Curve::new(format!("q{slot}"), palette::joint(slot)));
+            let commanded = slots.map(|slot| Curve::thin(format!("q{slot} command"), palette::joint(slot)));
+            let curves: Vec<Curve> = measured.chain(commanded).collect();
             joints.push(Series::new(format!("robot/joints/{}", finger.finger.name()), &curves, stream)?);
         }
         let speeds: Vec<Curve> = hand
@@ -59,11 +56,10 @@ impl<'a> Drawing<'a> {
             .iter()
             .flat_map(|f| {
                 let color = palette::finger(f.finger);
-                (0..f.joints.len()).map(move |slot| Curve::thin(format!("{} q{slot} [rad/s]", f.finger.name()), color))
+                (0..f.joints.len()).map(move |slot| Curve::thin(format!("{} q{slot}", f.finger.name()), color))
             })
             .collect();
-        let timing =
-            [Curve::new("age of the pose [ms]", palette::joint(1)), Curve::new("control tick [ms]", palette::joint(2))];
+        let timing = [Curve::new("pose age", palette::joint(1)), Curve::new("control tick", palette::joint(2))];
         modes(stream)?;
         let (boxes, cylinders, spheres) = shapes(hand, stream)?;
         Ok(Self {
@@ -75,9 +71,9 @@ impl<'a> Drawing<'a> {
             poses: Vec::with_capacity(hand.links.len()),
             space: Pace::new(SPACE_PERIOD),
             plots: Pace::new(PLOT_PERIOD),
-            k: Series::new("robot/mapping/k", &per_finger("k", ""), stream)?,
-            e_c: Series::new("robot/mapping/e_C", &per_finger("e_C", " [mm]"), stream)?,
-            e_q: Series::new("robot/mapping/e_Q", &per_finger("e_Q", " [rad]"), stream)?,
+            k: Series::new("robot/mapping/k", &per_finger("k"), stream)?,
+            e_c: Series::new("robot/mapping/e_C", &per_finger("e_C"), stream)?,
+            e_q: Series::new("robot/mapping/e_Q", &per_finger("e_Q"), stream)?,
             distance: Series::new("robot/mapping/distance", &distances, stream)?,
             joints,
             speed: Series::new("robot/joints/speed", &speeds, stream)?,
@@ -88,16 +84,13 @@ impl<'a> Drawing<'a> {
 
     pub(super) fn draw(&mut self, frame: &RobotFrame, stream: &RecordingStream) -> RecordingStreamResult<()> {
         stream.set_timestamp_nanos_since_epoch(TIMELINE, frame.time);
-        self.mode.set(frame.mode.name(), stream)?;
+        self.mode.set(frame.time, frame.mode.name(), stream)?;
         if self.plots.due(frame.time) {
             self.plot(frame, stream)?;
         }
         if self.space.due(frame.time) {
             self.pose(frame, stream)?;
-            self.command(frame, stream)?;
-            if let Some(mapping) = &frame.mapping {
-                self.targets(mapping, stream)?;
-            }
+            self.targets(frame, stream)?;
         }
         Ok(())
     }
@@ -118,12 +111,8 @@ impl<'a> Drawing<'a> {
             self.e_c.push(time, fingers.iter().map(|f| f.e_c * 1e3), stream)?;
             self.e_q.push(time, fingers.iter().map(|f| f.e_q), stream)?;
             // What the hand really does, not what the mapping asks for.
-            let tips: Vec<_> = self
-                .hand
-                .fingers
-                .iter()
-                .map(|f| f.tip(&f.select(&self.padded(&frame.q)), crate::hand::TipFrame::Pole))
-                .collect();
+            let tips: Vec<_> =
+                self.hand.fingers.iter().map(|f| f.tip(&f.select(&self.padded(&frame.q)), TipFrame::Pole)).collect();
             if let Some((thumb, others)) = tips.split_first() {
                 self.distance.push(time, others.iter().map(|tip| (tip - thumb).norm() * 1e3), stream)?;
             }
@@ -132,7 +121,7 @@ impl<'a> Drawing<'a> {
             let value = |values: &[f64], joint: usize| values.get(joint).copied().unwrap_or(f64::NAN);
             let commanded = finger.joints.iter().map(|joint| value(&frame.q_command, joint.joint));
             let measured = finger.joints.iter().map(|joint| value(&frame.q, joint.joint));
-            series.push(time, commanded.chain(measured), stream)?;
+            series.push(time, measured.chain(commanded), stream)?;
         }
         let speeds = self.hand.fingers.iter().flat_map(|finger| &finger.joints);
         let speeds = speeds.map(|joint| frame.dq.get(joint.joint).copied().unwrap_or(f64::NAN));
@@ -142,7 +131,7 @@ impl<'a> Drawing<'a> {
     }
 
     /// `q` with as many values as the hand has joints.
-    fn padded(&self, q: &[f64]) -> crate::hand::JointVector {
+    fn padded(&self, q: &[f64]) -> JointVector {
         let mut out = self.hand.home();
         for (value, &angle) in out.iter_mut().zip(q) {
             *value = angle;
@@ -164,55 +153,56 @@ impl<'a> Drawing<'a> {
         };
         let (centers, turns) = place(&self.boxes);
         let boxes = Boxes3D::update_fields().with_centers(centers).with_quaternions(turns);
-        stream.log("robot/hand/boxes", &boxes)?;
         let (centers, turns) = place(&self.cylinders);
         let cylinders = Cylinders3D::update_fields().with_centers(centers).with_quaternions(turns);
-        stream.log("robot/hand/cylinders", &cylinders)?;
         let (centers, _) = place(&self.spheres);
-        stream.log("robot/hand/spheres", &Ellipsoids3D::update_fields().with_centers(centers))
+        let spheres = Ellipsoids3D::update_fields().with_centers(centers);
+        stream.log("robot/hand", &[&boxes as &dyn AsComponents, &cylinders, &spheres])
     }
 
-    /// The commanded posture as a skeleton: hidden inside the fingers while they follow, in sight when they do not.
-    fn command(&self, frame: &RobotFrame, stream: &RecordingStream) -> RecordingStreamResult<()> {
-        let q = self.padded(&frame.q_command);
-        let strips: Vec<Vec<[f32; 3]>> = self
-            .hand
-            .fingers
-            .iter()
-            .map(|finger| {
-                let (mut position, mut rotation) = (Vector3::zeros(), Matrix3::identity());
-                let mut strip = Vec::with_capacity(MAX_FINGER_JOINTS + 1);
-                for (joint, angle) in finger.joints.iter().zip(finger.select(&q)) {
-                    position += rotation * joint.translation;
-                    rotation *= joint.rotation_at(angle);
-                    strip.push(point(&(self.view_from_palm * position)));
-                }
-                strip.push(point(&(self.view_from_palm * (position + rotation * finger.pole))));
-                strip
-            })
-            .collect();
-        let lines = LineStrips3D::new(strips).with_colors([palette::COMMAND]).with_radii([0.0012]);
-        stream.log("robot/hand/command", &lines)
-    }
-
-    /// p_Q, p_C and p_input of every finger: p_input runs along the line from p_Q to p_C as k grows.
-    fn targets(&self, mapping: &MappingOutput, stream: &RecordingStream) -> RecordingStreamResult<()> {
+    /// The commanded posture as a skeleton, hidden inside the fingers while they follow, and p_Q, p_C and p_input of
+    /// every finger: p_input runs along the line from p_Q to p_C as k grows.
+    fn targets(&self, frame: &RobotFrame, stream: &RecordingStream) -> RecordingStreamResult<()> {
         let show = |p: &Vector3<f64>| point(&(self.view_from_palm * p));
-        // Out of the thumb's reach p_C steers nothing, and far outside the hand it would only distract.
-        let active: Vec<_> = mapping.fingers().iter().filter(|f| f.k > 0.0).collect();
-        let lines = LineStrips3D::new(active.iter().map(|f| [show(&f.p_joint), show(&f.p_cartesian)]))
-            .with_colors(active.iter().map(|f| palette::fade(palette::finger(f.finger), 0.4 + 0.6 * f.k)))
-            .with_radii([0.0008]);
-        stream.log("robot/hand/blend", &lines)?;
-        let mut dots: Vec<([f32; 3], Color, f32)> = Vec::with_capacity(3 * mapping.fingers().len());
-        dots.extend(mapping.fingers().iter().map(|f| (show(&f.p_joint), palette::JOINT, 0.0032)));
-        dots.extend(active.iter().map(|f| (show(&f.p_cartesian), palette::CARTESIAN, 0.0036)));
-        dots.extend(active.iter().map(|f| (show(&f.p_input), palette::BLEND, 0.0044)));
+        let q = self.padded(&frame.q_command);
+        let mut strips: Vec<(Vec<[f32; 3]>, Color, f32)> = Vec::new();
+        for finger in &self.hand.fingers {
+            let skeleton = skeleton(finger, &finger.select(&q)).iter().map(show).collect();
+            strips.push((skeleton, palette::COMMAND, 0.0012));
+        }
+        let mut dots: Vec<([f32; 3], Color, f32)> = Vec::new();
+        for signals in frame.mapping.iter().flat_map(|mapping| mapping.fingers()) {
+            let (p_joint, p_cartesian) = (show(&signals.p_joint), show(&signals.p_cartesian));
+            dots.push((p_joint, palette::JOINT, 0.0032));
+            // Outside the spheres p_C steers nothing, and far from the hand it would only distract.
+            if signals.k > 0.0 {
+                let color = palette::fade(palette::finger(signals.finger), 0.4 + 0.6 * signals.k);
+                strips.push((vec![p_joint, p_cartesian], color, 0.0009));
+                dots.push((p_cartesian, palette::CARTESIAN, 0.0036));
+                dots.push((show(&signals.p_input), palette::BLEND, 0.0044));
+            }
+        }
+        let lines = LineStrips3D::new(strips.iter().map(|strip| strip.0.as_slice()))
+            .with_colors(strips.iter().map(|strip| strip.1))
+            .with_radii(strips.iter().map(|strip| strip.2));
         let points = Points3D::new(dots.iter().map(|dot| dot.0))
             .with_colors(dots.iter().map(|dot| dot.1))
             .with_radii(dots.iter().map(|dot| dot.2));
-        stream.log("robot/hand/targets", &points)
+        stream.log("robot/hand/targets", &[&lines as &dyn AsComponents, &points])
     }
+}
+
+/// The joint centres and the tip of a finger in the palm frame, m; `q` are the finger's own angles.
+fn skeleton(finger: &FingerChain, q: &[f64]) -> Vec<Vector3<f64>> {
+    let (mut position, mut rotation) = (Vector3::zeros(), Matrix3::identity());
+    let mut points = Vec::with_capacity(finger.joints.len() + 1);
+    for (joint, &angle) in finger.joints.iter().zip(q) {
+        position += rotation * joint.translation;
+        rotation *= joint.rotation_at(angle);
+        points.push(position);
+    }
+    points.push(position + rotation * finger.pole);
+    points
 }
 
 /// Sends sizes and colours of the hand's shapes.
@@ -222,8 +212,14 @@ fn shapes(hand: &HandModel, stream: &RecordingStream) -> RecordingStreamResult<(
     let mut colors: [Vec<Color>; 3] = Default::default();
     for (index, link) in hand.links.iter().enumerate() {
         for visual in &link.visuals {
-            let [r, g, b, a] = visual.rgba.map(|c| (c.clamp(0.0, 1.0) * 255.0) as u8);
-            let color = palette::rgba(r, g, b, a);
+            let color = match finger_of(hand, index) {
+                // The light rubber of the fingertips, so that the fingers can be told apart.
+                Some(finger) if visual.rgba[..3].iter().all(|&c| c > 0.6) => palette::finger(finger),
+                _ => {
+                    let [r, g, b, a] = visual.rgba.map(|c| (c.clamp(0.0, 1.0) * 255.0) as u8);
+                    palette::rgba(r, g, b, a)
+                }
+            };
             match visual.shape {
                 Shape::Box { size } => {
                     boxes.push((index, visual.origin));
@@ -245,13 +241,25 @@ fn shapes(hand: &HandModel, stream: &RecordingStream) -> RecordingStreamResult<(
         }
     }
     let [of_boxes, of_cylinders, of_spheres] = colors;
-    let boxes3d = Boxes3D::from_half_sizes(halves).with_colors(of_boxes).with_fill_mode(FillMode::Solid);
-    stream.log_static("robot/hand/boxes", &boxes3d)?;
+    let fill = FillMode::Solid;
+    let boxes3d = Boxes3D::from_half_sizes(halves).with_colors(of_boxes).with_fill_mode(fill);
     let cylinders3d = Cylinders3D::from_lengths_and_radii(lengths, radii).with_colors(of_cylinders);
-    stream.log_static("robot/hand/cylinders", &cylinders3d.with_fill_mode(FillMode::Solid))?;
-    let spheres3d = Ellipsoids3D::from_radii(balls).with_colors(of_spheres).with_fill_mode(FillMode::Solid);
-    stream.log_static("robot/hand/spheres", &spheres3d)?;
+    let cylinders3d = cylinders3d.with_fill_mode(fill);
+    let spheres3d = Ellipsoids3D::from_radii(balls).with_colors(of_spheres).with_fill_mode(fill);
+    stream.log_static("robot/hand", &[&boxes3d as &dyn AsComponents, &cylinders3d, &spheres3d])?;
     Ok((boxes, cylinders, spheres))
+}
+
+/// The finger that carries a link.
+fn finger_of(hand: &HandModel, mut link: usize) -> Option<Finger> {
+    loop {
+        let current = hand.links.get(link)?;
+        let carried = |finger: &&FingerChain| finger.joints.iter().any(|joint| Some(joint.joint) == current.joint);
+        if let Some(finger) = hand.fingers.iter().find(carried) {
+            return Some(finger.finger);
+        }
+        link = current.parent?;
+    }
 }
 
 /// Sends the colours of the modes.
