@@ -11,7 +11,7 @@ use teleop_common::net::{NetError, Publisher, Session, Stream, clock};
 use teleop_common::time::{Histogram, MonoTime};
 use teleop_common::viz::{Level, Logger, RobotFrame};
 use teleop_common::wire::{
-    HealthMessage, JointStateMessage, MappingMessage, Quantiles, Rejection, Stamper, pack_joints,
+    HealthMessage, JointStateMessage, MappingMessage, Quantiles, REJECTIONS, Rejection, Stamper, pack_joints,
 };
 
 use crate::control::Fault;
@@ -37,6 +37,8 @@ pub struct Telemetry {
     next_health: MonoTime,
     next_view: MonoTime,
     mode: Option<Mode>,
+    // Counters at the last change of mode.
+    rejected: [u64; REJECTIONS],
     tick_times: Histogram,
     slowest: Duration,
     // Tick number and time of the last health message, for the measured rate.
@@ -71,6 +73,7 @@ impl Telemetry {
             next_health: MonoTime(0),
             next_view: MonoTime(0),
             mode: None,
+            rejected: [0; REJECTIONS],
             tick_times: Histogram::default(),
             slowest: Duration::ZERO,
             rate_mark: None,
@@ -169,6 +172,18 @@ impl Telemetry {
         self.slowest = Duration::ZERO;
     }
 
+    /// Poses refused since the last change of mode, in words.
+    fn refusals(&mut self) -> String {
+        let rejected = self.receiver.lock().unwrap_or_else(PoisonError::into_inner).counts().rejected;
+        let before = std::mem::replace(&mut self.rejected, rejected);
+        let risen = Rejection::ALL.iter().filter_map(|reason| {
+            let count = rejected[reason.index()] - before[reason.index()];
+            (count > 0).then(|| format!("{count} {}", reason.name()))
+        });
+        let risen: Vec<_> = risen.collect();
+        if risen.is_empty() { String::new() } else { format!(", refused: {}", risen.join(", ")) }
+    }
+
     /// A change of mode, in the log and in the viewer.
     fn tell_mode(&mut self, record: &LoopRecord) {
         let tick = &record.record;
@@ -176,17 +191,11 @@ impl Telemetry {
         let (level, text) = match tick.mode {
             Mode::Idle => (Level::Info, "idle: waiting for an operator".to_owned()),
             Mode::Engaged => {
+                self.refusals();
                 let operator = tick.sample.map_or(0, |sample| sample.epoch);
                 (Level::Info, format!("engaged: following operator {operator:016x}"))
             }
-            Mode::Holding => {
-                let rejected = self.receiver.lock().unwrap_or_else(PoisonError::into_inner).counts().rejected;
-                let reasons: Vec<_> = Rejection::ALL.iter().filter(|reason| rejected[reason.index()] > 0).collect();
-                let reasons: Vec<_> =
-                    reasons.iter().map(|reason| format!("{} {}", rejected[reason.index()], reason.name())).collect();
-                let refused = if reasons.is_empty() { "none".to_owned() } else { reasons.join(", ") };
-                (Level::Warn, format!("holding: no fresh pose (refused so far: {refused})"))
-            }
+            Mode::Holding => (Level::Warn, format!("holding: no fresh pose{}", self.refusals())),
             Mode::Faulted => {
                 let why = match (tick.fault, record.driver_error) {
                     (Fault::Driver, Some(error)) => error.to_string(),

@@ -120,7 +120,7 @@ pub struct HealthMessage {
     pub rejected: [u64; REJECTIONS],
     /// Times the hand went to holding because poses stopped.
     pub holds: u64,
-    /// Age of the poses obeyed, capture to tick, ms.
+    /// Age of the poses obeyed, capture to arrival, ms.
     pub age_ms: Quantiles,
     /// Telemetry records that found their queue full.
     pub telemetry_dropped: u64,
