@@ -18,8 +18,8 @@ use crate::shutdown::Shutdown;
 use crate::terminal::{Terminal, say};
 use crate::watch::{WatchOptions, watch};
 
-/// Default log filter. zenoh warns of its own settings at every start; what matters of it shows in the status line.
-const LOG_FILTER: &str = "info,zenoh=error,re_=warn,rerun=warn";
+/// Default log filter. zenoh and Rerun warn of settings that are meant; what matters of them shows in the status line.
+const LOG_FILTER: &str = "info,zenoh=error,re_=error,rerun=error";
 
 /// Why the program ends other than well.
 #[derive(Debug)]

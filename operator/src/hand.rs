@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use teleop_common::hand::HandSide;
 use teleop_common::master::{
-    Calibration, CalibrationError, Calibrator, Diagnosis, Fitter, Inspector, MasterGeometry, MasterPose,
+    Calibration, CalibrationError, Calibrator, Diagnosis, Fitter, Inspector, MIN_FRAMES, MasterGeometry, MasterPose,
 };
 use teleop_common::recording::FrameData;
 
@@ -112,6 +112,10 @@ impl PoseFinder {
                         tracing::info!("measured: {}", report.join(", "));
                         self.tracker = Tracker::following(&calibration);
                         Posed::Measuring { done: 1.0 }
+                    }
+                    // A slow tracker needs more time, not another attempt.
+                    Err(CalibrationError::TooFewFrames { frames, .. }) => {
+                        Posed::Measuring { done: frames as f64 / MIN_FRAMES as f64 }
                     }
                     Err(error) => {
                         self.tracker = Tracker::measuring();
@@ -226,6 +230,16 @@ mod tests {
         let last = (301..800).map(|i| finder.pose(at(i), &mirrored(i), false)).last().unwrap();
         let Posed::Refused(refusal) = last else { panic!("{last:?}") };
         assert!(refusal.to_string().contains("left hand"), "{refusal}");
+    }
+
+    #[test]
+    fn a_slow_tracker_is_given_the_time_it_needs() {
+        let mut finder = PoseFinder::new(MasterGeometry::PARADIGMATIC);
+        let at = |i: u32| Duration::from_millis(200) * i;
+        let posed: Vec<Posed> = (0..40).map(|i| finder.pose(at(i), &frame(at(i)), false)).collect();
+        let measuring = posed.iter().take_while(|posed| matches!(posed, Posed::Measuring { .. })).count();
+        assert_eq!(measuring, MIN_FRAMES, "{posed:?}");
+        assert!(posed[measuring..].iter().all(|posed| matches!(posed, Posed::Pose { .. })));
     }
 
     #[test]

@@ -1,5 +1,6 @@
 //! Entry point of the `operator` process.
 
+use std::io::Write as _;
 use std::process::ExitCode;
 
 use clap::Parser as _;
@@ -9,7 +10,7 @@ fn main() -> ExitCode {
     match app::main(Cli::parse()) {
         Ok(()) => ExitCode::SUCCESS,
         Err(failure) => {
-            eprintln!("error: {failure:#}");
+            writeln!(std::io::stderr(), "error: {failure:#}").ok();
             failure.exit_code()
         }
     }

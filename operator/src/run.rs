@@ -10,24 +10,27 @@ use teleop_common::key::Keys;
 use teleop_common::master::{Calibration, MasterGeometry};
 use teleop_common::net::clock::{now, random_epoch};
 use teleop_common::net::{Session, Stream};
-use teleop_common::viz::{Scene, Viz};
+use teleop_common::viz::{Level, Scene, Viz};
 
 use crate::app::{Failure, OrFail as _, open_session};
 use crate::calibrate;
 use crate::cli::RunArgs;
 use crate::feedback::{Feedback, subscribe};
 use crate::hand::PoseFinder;
-use crate::pipeline::{Parts, Pipeline, Progress};
+use crate::pipeline::{Parts, Pipeline, Progress, picture_time};
 use crate::record::Recorder;
 use crate::shutdown::Shutdown;
 use crate::source::{GestureSource, RecordingFile, Source, SourceSpec, ZenohSource};
 use crate::stream::PoseStream;
-use crate::terminal::{RateMeter, Status, Terminal};
+use crate::terminal::{RateMeter, Status, Terminal, status_line};
 
 /// Refresh of the status line.
 const REFRESH: Duration = Duration::from_millis(200);
 /// Time the viewer gets to take what is queued.
 const VIEWER_TIMEOUT: Duration = Duration::from_millis(500);
+
+/// Time the robot gets to describe itself.
+const DESCRIBE_TIMEOUT: Duration = Duration::from_millis(300);
 
 /// How a run went.
 #[derive(Clone, Debug)]
@@ -173,15 +176,17 @@ pub fn run(args: &RunArgs, shutdown: &Shutdown, terminal: &Terminal) -> Result<S
     let subscribers = subscribe(&session, &keys, &feedback).or_runtime()?;
     let publisher = session.publisher(&keys.pose(), Stream::Command).or_runtime()?;
     let token = session.live_token(&keys.live_operator(epoch)).or_runtime()?;
-    let scene = Scene::operator(keys.name(), side.unwrap_or(HandSide::Right));
+    let side = side.or_else(|| robot_side(&session, &keys)).unwrap_or(HandSide::Right);
+    let scene = Scene::operator(keys.name(), side);
     let viz = Viz::start(args.viewer.clone(), scene).or_runtime()?;
+    let logger = viz.logger();
     let (stream, sender) = PoseStream::start(publisher, epoch, Arc::clone(&feedback)).or_runtime()?;
     let pipeline = Pipeline::start(Parts {
         source: open(plan.input, &session, &keys)?,
         finder: plan.finder,
         sender,
         recorder: record,
-        logger: viz.logger(),
+        logger: logger.clone(),
         feedback: Arc::clone(&feedback),
         // The beginning of a recording should not be lost.
         wait_for_robot: is_recording,
@@ -192,14 +197,19 @@ pub fn run(args: &RunArgs, shutdown: &Shutdown, terminal: &Terminal) -> Result<S
     let mut display = terminal.display(is_recording);
     let mut meter = RateMeter::default();
     while !pipeline.is_finished() {
-        display.show(&Status {
+        let status = Status {
             name: keys.name().to_owned(),
             endpoints: args.robot.connect.join(", "),
             robot: feedback.snapshot(now()),
             rate: meter.rate(stream.counters().sent.load(Ordering::Relaxed), Instant::now()),
             progress: pipeline.progress(),
             lost: recorder.as_ref().map_or(0, Recorder::lost),
-        });
+        };
+        if display.show(&status) {
+            let level = if status.robot.reason.is_some() { Level::Warn } else { Level::Info };
+            let time = picture_time(now(), status.robot.picture_offset_ns);
+            logger.log_text(time, level, &status_line(&status));
+        }
         let wait = end.map_or(REFRESH, |end| end.saturating_duration_since(Instant::now()).min(REFRESH));
         if shutdown.wait(wait) || end.is_some_and(|end| Instant::now() >= end) {
             break;
@@ -226,9 +236,20 @@ pub fn run(args: &RunArgs, shutdown: &Shutdown, terminal: &Terminal) -> Result<S
     Ok(Summary { sent, progress, round_trip, recorded })
 }
 
+/// The side of the robot's hand, if it is there to say: a hand that belongs to neither side is drawn as that one.
+fn robot_side(session: &Session, keys: &Keys) -> Option<HandSide> {
+    let description = session.get(&keys.describe(), DESCRIBE_TIMEOUT).ok()?;
+    let description: serde_json::Value = serde_json::from_slice(&description).ok()?;
+    let side = description.get("hand")?.as_str()?;
+    [HandSide::Right, HandSide::Left].into_iter().find(|known| known.name() == side)
+}
+
 fn open(input: Input, session: &Session, keys: &Keys) -> Result<Source, Failure> {
     match input {
         Input::Ready(source) => Ok(source),
-        Input::Zenoh => ZenohSource::subscribe(session, keys).map(Source::Zenoh).or_runtime(),
+        Input::Zenoh => {
+            tracing::info!("hand data may come on {} at {}", keys.hand_input(), session.locators().join(", "));
+            ZenohSource::subscribe(session, keys).map(Source::Zenoh).or_runtime()
+        }
     }
 }

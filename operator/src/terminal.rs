@@ -13,6 +13,8 @@ use crate::pipeline::Progress;
 
 /// Status lines of a program that is not watched on a terminal.
 const LINE_EVERY: Duration = Duration::from_secs(2);
+/// A robot that is there answers within this time; only then its absence is told.
+const GRACE: Duration = Duration::from_millis(600);
 /// Steps of the progress bar.
 const PROGRESS_STEPS: u64 = 1000;
 
@@ -187,7 +189,7 @@ impl Terminal {
             }
             Bars { line, progress }
         });
-        Display { bars, last: None }
+        Display { bars, start: Instant::now(), last: None }
     }
 }
 
@@ -205,27 +207,31 @@ struct Bars {
 /// The status on display; dropping it takes it off the terminal.
 pub struct Display {
     bars: Option<Bars>,
+    start: Instant,
     last: Option<(Instant, Status)>,
 }
 
 impl Display {
-    /// Shows `status`; to be called some times a second.
-    pub fn show(&mut self, status: &Status) {
+    /// Shows `status`; to be called some times a second. True if something happened that people should know.
+    pub fn show(&mut self, status: &Status) -> bool {
+        if !status.robot.connected && self.start.elapsed() < GRACE {
+            return false;
+        }
+        let news = self.last.as_ref().is_none_or(|(_, before)| is_news(before, status));
         if let Some(bars) = &self.bars {
             bars.line.set_message(status_line(status));
             if let (Some(bar), Some(progress)) = (&bars.progress, status.progress.fraction) {
                 bar.set_position((progress.clamp(0.0, 1.0) * PROGRESS_STEPS as f64) as u64);
             }
-            return;
-        }
-        let due = self.last.as_ref().is_none_or(|(at, before)| at.elapsed() >= LINE_EVERY || is_news(before, status));
-        if due {
+            self.last = Some((Instant::now(), status.clone()));
+        } else if news || self.last.as_ref().is_some_and(|(at, _)| at.elapsed() >= LINE_EVERY) {
             let progress =
                 status.progress.fraction.map_or_else(String::new, |done| format!("  |  {:.0} %", 100.0 * done));
             // A reader that went away is no reason to stop streaming.
             say(&format!("{}{progress}", status_line(status))).ok();
             self.last = Some((Instant::now(), status.clone()));
         }
+        news
     }
 }
 
