@@ -10,7 +10,7 @@ use std::time::Duration;
 use anyhow::Context as _;
 use teleop_common::hand::{FingerChain, HandModel, Joint};
 use teleop_common::key::Keys;
-use teleop_common::net::{Session, SessionConfig, clock};
+use teleop_common::net::{NetError, Session, SessionConfig, clock};
 use teleop_common::viz::{Hub, HubOptions, Scene, Viz};
 use teleop_common::wire;
 
@@ -46,10 +46,16 @@ pub fn main(cli: Cli) -> ExitCode {
         Err(error) => {
             eprintln!("error: {error:#}");
             // What the user can mend on the command line or in a file is usage.
-            let usage = error.chain().any(|cause| cause.is::<ConfigError>() || cause.is::<UsageError>());
-            ExitCode::from(if usage { 2 } else { 1 })
+            ExitCode::from(if error.chain().any(is_usage) { 2 } else { 1 })
         }
     }
+}
+
+fn is_usage(cause: &(dyn std::error::Error + 'static)) -> bool {
+    let of_endpoint = |error: &NetError| {
+        matches!(error, NetError::Endpoint { .. } | NetError::Setting { .. } | NetError::ConfigFile { .. })
+    };
+    cause.is::<ConfigError>() || cause.is::<UsageError>() || cause.downcast_ref().is_some_and(of_endpoint)
 }
 
 /// Something on the command line that cannot be used.

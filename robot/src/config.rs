@@ -92,7 +92,7 @@ pub struct Config {
 #[non_exhaustive]
 pub enum ConfigError {
     /// The file cannot be read.
-    #[error("cannot read {path}: {source}", path = path.display())]
+    #[error("cannot read {path}", path = path.display())]
     Read {
         /// The file.
         path: PathBuf,
@@ -121,7 +121,7 @@ pub enum ConfigError {
         rule: &'static str,
     },
     /// The hand's URDF or description cannot be used.
-    #[error("{origin}: {source}")]
+    #[error("{origin}")]
     Hand {
         /// Where it came from.
         origin: String,

@@ -82,10 +82,10 @@ pub enum StartError {
     #[error("real-time priority was refused ({0}): give the process CAP_SYS_NICE, or use --realtime auto")]
     Priority(String),
     /// No thread could be made.
-    #[error("cannot start the control thread: {0}")]
+    #[error("cannot start the control thread")]
     Thread(#[from] std::io::Error),
     /// The hand did not start.
-    #[error("cannot start the {name}: {source}")]
+    #[error("cannot start the {name}")]
     Driver {
         /// Which driver.
         name: &'static str,
