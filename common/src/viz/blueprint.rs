@@ -58,6 +58,9 @@ fn messages() -> RecordingStreamResult<Vec<LogMsg>> {
 fn layout() -> Node {
     let human = space("human hand", "operator/hand", Eye { target: [0.026, 0.080, 0.020], distance: 0.275 });
     let robot = space("robot hand", "robot/hand", Eye { target: [0.010, 0.020, 0.030], distance: 0.46 });
+    // The lanes of a StateTimelineView stay where they were when it was opened; a plot of bands moves with the time.
+    let mode = plot("mode (above) and operator (below)", &["/robot/band", "/operator/band"], Some([-0.6, 1.6]));
+    let history = view("StateTimeline", "since the start", "/", &["/robot/mode", "/operator/connection"]);
     let joints = ["thumb", "index", "middle", "ring"]
         .map(|finger| plot(&format!("{finger} [rad]"), &[&format!("/robot/joints/{finger}")], None))
         .into_iter()
@@ -71,7 +74,7 @@ fn layout() -> Node {
             1.25,
             Node::Column(vec![
                 (4.2, Node::Row(vec![(1.0, human), (1.0, robot)])),
-                (0.85, lanes("mode", &["/robot/mode", "/operator/connection"])),
+                (0.95, Node::Tabs(vec![mode, history], 0)),
                 (1.35, bottom),
             ]),
         ),
@@ -154,11 +157,6 @@ fn plot(name: &str, contents: &[&str], range: Option<[f64; 2]>) -> Node {
         Some(range) => view.with("ScalarAxis", &ScalarAxis::new().with_range(range)),
         None => view,
     })
-}
-
-/// Coloured lanes of states.
-fn lanes(name: &str, contents: &[&str]) -> Node {
-    Node::View(windowed(bare("StateTimeline", name, "/", contents)))
 }
 
 fn windowed(view: View) -> View {

@@ -7,7 +7,7 @@
 
 use std::net::{SocketAddr, ToSocketAddrs};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, AtomicU8, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU8, AtomicU64, Ordering};
 use std::sync::mpsc::{self, RecvTimeoutError};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
@@ -30,6 +30,8 @@ const LOOK: Duration = Duration::from_secs(1);
 const PATIENCE: u32 = 3;
 /// How long a new stream may take to connect.
 const CONNECT: Duration = Duration::from_secs(5);
+/// How long a connected viewer may keep the writer waiting before people are told.
+const HANG: Duration = Duration::from_secs(3);
 /// How often the writer drains the queue.
 const DRAIN: Duration = Duration::from_millis(10);
 /// How long data may wait to be sent together, to a viewer and to a file.
@@ -131,7 +133,12 @@ impl Supervisor {
         if let Some(link) = &self.link {
             let state = link.state();
             if state == State::Open && self.silent < PATIENCE {
-                return self.status.set(self.connected(address));
+                let status = if link.hangs() {
+                    Status::Waiting { address, reason: "it is connected, but does not read".to_owned() }
+                } else {
+                    self.connected(address)
+                };
+                return self.status.set(status);
             }
             if state == State::Opening && answering {
                 return self.status.set(Status::Waiting { address, reason: "connecting".to_owned() });
@@ -249,6 +256,8 @@ struct Link {
     client: Option<Arc<GrpcSink>>,
     order: Arc<AtomicU8>,
     since: Instant,
+    /// When the writer last was through with the queue, ms after `since`.
+    beat: Arc<AtomicU64>,
     was_open: AtomicBool,
     writer: JoinHandle<()>,
 }
@@ -270,10 +279,12 @@ impl Link {
         client: Option<Arc<GrpcSink>>,
     ) -> Result<Self, std::io::Error> {
         let order = Arc::new(AtomicU8::new(order::WRITE));
-        let theirs = Arc::clone(&order);
+        let (since, beat) = (Instant::now(), Arc::new(AtomicU64::new(0)));
+        let (theirs, alive) = (Arc::clone(&order), Arc::clone(&beat));
+        let beat_now = move || alive.store(since.elapsed().as_millis() as u64, Ordering::Relaxed);
         let writer = thread::Builder::new().name("viewer-writer".to_owned()).spawn(move || {
             let written = open_stream(&scene, sink).and_then(|stream| {
-                let result = write(&stream, &scene, &feed, &theirs);
+                let result = write(&stream, &scene, &feed, &theirs, &beat_now);
                 // Waits for the data to go out, for ever if need be: nobody waits for this thread.
                 drop(stream);
                 result
@@ -282,7 +293,7 @@ impl Link {
                 tracing::warn!(target: "viewer", "{error}");
             }
         })?;
-        Ok(Self { client, order, since: Instant::now(), was_open: AtomicBool::new(false), writer })
+        Ok(Self { client, order, since, beat, was_open: AtomicBool::new(false), writer })
     }
 
     fn state(&self) -> State {
@@ -298,6 +309,12 @@ impl Link {
             Some(GrpcSinkConnectionState::Disconnected(_)) if was_open => State::Closed,
             Some(_) => State::Refused,
         }
+    }
+
+    /// True if the writer has been stuck for a while: the viewer does not read.
+    fn hangs(&self) -> bool {
+        let beat = Duration::from_millis(self.beat.load(Ordering::Relaxed));
+        !self.writer.is_finished() && self.since.elapsed().saturating_sub(beat) > HANG
     }
 
     /// Writes what is queued; false if that took longer than `limit`.
@@ -321,8 +338,14 @@ impl Drop for Link {
     }
 }
 
-/// The writer: drains the queue into the stream. Blocks for as long as the viewer does.
-fn write(stream: &RecordingStream, scene: &Scene, feed: &Feed, order: &AtomicU8) -> RecordingStreamResult<()> {
+/// The writer: drains the queue into the stream. Blocks for as long as the viewer does; calls `beat` whenever not.
+fn write(
+    stream: &RecordingStream,
+    scene: &Scene,
+    feed: &Feed,
+    order: &AtomicU8,
+    beat: &dyn Fn(),
+) -> RecordingStreamResult<()> {
     let mut writer = Writer::new(scene, stream)?;
     loop {
         let finish = order.load(Ordering::Acquire) == order::FINISH;
@@ -344,6 +367,7 @@ fn write(stream: &RecordingStream, scene: &Scene, feed: &Feed, order: &AtomicU8)
             }
             return Ok(());
         }
+        beat();
         thread::sleep(DRAIN);
     }
 }

@@ -39,6 +39,7 @@ pub(super) struct Drawing<'a> {
     delta: Series,
     network: Series,
     connection: Lane,
+    connection_band: Series,
 }
 
 impl<'a> Drawing<'a> {
@@ -49,9 +50,10 @@ impl<'a> Drawing<'a> {
             .collect();
         let network =
             [Curve::new("round trip", palette::joint(0)), Curve::new("keypoint residual [mm]", palette::joint(3))];
-        let style = StateConfiguration::new()
-            .with_values([CONNECTED, ALONE])
-            .with_colors([palette::finger(Finger::Index), palette::FAINT]);
+        let states = [(CONNECTED, palette::finger(Finger::Index)), (ALONE, palette::FAINT)];
+        let style =
+            StateConfiguration::new().with_values(states.map(|state| state.0)).with_colors(states.map(|state| state.1));
+        let bands = states.map(|(name, color)| Curve::band(name, color));
         stream.log_static("operator/connection", &style)?;
         Ok(Self {
             side,
@@ -63,6 +65,7 @@ impl<'a> Drawing<'a> {
             delta: Series::new("operator/distance", &distances, stream)?,
             network: Series::new("operator/network", &network, stream)?,
             connection: Lane::new("operator/connection"),
+            connection_band: Series::new("operator/band", &bands, stream)?,
         })
     }
 
@@ -71,6 +74,8 @@ impl<'a> Drawing<'a> {
         let connection = if frame.round_trip.is_some() { CONNECTED } else { ALONE };
         self.connection.set(frame.time, connection, stream)?;
         if self.plots.due(frame.time) {
+            let band = [CONNECTED, ALONE].map(|state| if state == connection { 0.0 } else { f64::NAN });
+            self.connection_band.push(frame.time, band, stream)?;
             let thumb = frame.pose.tip(Finger::Thumb);
             let delta = self.opposing.iter().map(|finger| (frame.pose.tip(*finger) - thumb).norm() * 1e3);
             self.delta.push(frame.time, delta, stream)?;
@@ -86,6 +91,7 @@ impl<'a> Drawing<'a> {
 
     pub(super) fn finish(&mut self, stream: &RecordingStream) -> RecordingStreamResult<()> {
         self.delta.flush(stream)?;
+        self.connection_band.flush(stream)?;
         self.network.flush(stream)
     }
 

@@ -34,6 +34,7 @@ pub(super) struct Drawing<'a> {
     speed: Series,
     timing: Series,
     mode: Lane,
+    mode_band: Series,
 }
 
 impl<'a> Drawing<'a> {
@@ -79,6 +80,11 @@ impl<'a> Drawing<'a> {
             speed: Series::new("robot/joints/speed", &speeds, stream)?,
             timing: Series::new("robot/timing", &timing, stream)?,
             mode: Lane::new("robot/mode"),
+            mode_band: Series::new(
+                "robot/band",
+                &Mode::ALL.map(|mode| Curve::band(mode.name(), mode_color(mode))),
+                stream,
+            )?,
         })
     }
 
@@ -97,7 +103,9 @@ impl<'a> Drawing<'a> {
 
     pub(super) fn finish(&mut self, stream: &RecordingStream) -> RecordingStreamResult<()> {
         let mapping = [&mut self.k, &mut self.e_c, &mut self.e_q, &mut self.distance];
-        for series in mapping.into_iter().chain(&mut self.joints).chain([&mut self.speed, &mut self.timing]) {
+        for series in
+            mapping.into_iter().chain(&mut self.joints).chain([&mut self.speed, &mut self.timing, &mut self.mode_band])
+        {
             series.flush(stream)?;
         }
         Ok(())
@@ -126,6 +134,8 @@ impl<'a> Drawing<'a> {
         let speeds = self.hand.fingers.iter().flat_map(|finger| &finger.joints);
         let speeds = speeds.map(|joint| frame.dq.get(joint.joint).copied().unwrap_or(f64::NAN));
         self.speed.push(time, speeds, stream)?;
+        let band = Mode::ALL.map(|mode| if mode == frame.mode { 1.0 } else { f64::NAN });
+        self.mode_band.push(time, band, stream)?;
         let milli = |value: Option<f64>| value.map_or(f64::NAN, |value| value * 1e3);
         self.timing.push(time, [milli(frame.pose_age), milli(frame.tick)], stream)
     }
@@ -264,14 +274,15 @@ fn finger_of(hand: &HandModel, mut link: usize) -> Option<Finger> {
 
 /// Sends the colours of the modes.
 fn modes(stream: &RecordingStream) -> RecordingStreamResult<()> {
-    let style =
-        StateConfiguration::new().with_values(Mode::ALL.map(Mode::name)).with_colors(Mode::ALL.map(
-            |mode| match mode {
-                Mode::Idle => palette::FAINT,
-                Mode::Engaged => palette::rgb(40, 200, 140),
-                Mode::Holding => palette::rgb(240, 170, 40),
-                Mode::Faulted => palette::rgb(235, 64, 52),
-            },
-        ));
+    let style = StateConfiguration::new().with_values(Mode::ALL.map(Mode::name)).with_colors(Mode::ALL.map(mode_color));
     stream.log_static("robot/mode", &style)
+}
+
+const fn mode_color(mode: Mode) -> Color {
+    match mode {
+        Mode::Idle => palette::FAINT,
+        Mode::Engaged => palette::rgb(40, 200, 140),
+        Mode::Holding => palette::rgb(240, 170, 40),
+        Mode::Faulted => palette::rgb(235, 64, 52),
+    }
 }

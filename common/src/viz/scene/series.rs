@@ -22,6 +22,13 @@ impl Curve {
     }
 }
 
+impl Curve {
+    /// A band, for a state that is there or not.
+    pub(super) fn band(name: impl Into<String>, color: Color) -> Self {
+        Self { name: name.into(), color, width: 9.0 }
+    }
+}
+
 /// The curves of one entity, sent column-wise.
 pub(super) struct Series {
     path: String,
