@@ -108,8 +108,9 @@ pub fn main(cli: Cli) -> Result<(), Failure> {
 fn init_log(args: &LogArgs, terminal: &Terminal) -> Result<(), Failure> {
     use tracing_subscriber::EnvFilter;
     let text = args.log.clone().or_else(|| std::env::var("RUST_LOG").ok()).unwrap_or_else(|| LOG_FILTER.to_owned());
+    // Its own words include their cause already.
     let filter = EnvFilter::try_new(&text)
-        .with_context(|| format!("log filter {text:?} is not one; write for example debug or info,zenoh=debug"))
+        .map_err(|error| anyhow!("log filter {text:?} is none ({error}); write for example debug or info,zenoh=debug"))
         .or_usage()?;
     let terminal = terminal.clone();
     tracing_subscriber::fmt()
