@@ -58,7 +58,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         };
         let before = Instant::now();
         log_robot.log_robot(frame);
-        if tick % 3 == 0 {
+        if tick.is_multiple_of(3) {
             let round_trip = Some(0.003 + 0.001 * (t * 5.0).cos());
             log_operator.log_operator(OperatorFrame { time, pose, r1, r2, residual: None, round_trip });
         }

@@ -1,5 +1,6 @@
 //! The Rerun shell against real servers and files on this machine; the browser's side is looked at elsewhere.
 #![cfg(feature = "viz")]
+#![allow(clippy::unwrap_used, reason = "a test fails by it")]
 
 use std::net::{Ipv4Addr, SocketAddr, TcpListener, TcpStream};
 use std::time::{Duration, Instant};

@@ -59,7 +59,7 @@ fn layout() -> Node {
     let human = space("human hand", "operator/hand", Eye { target: [0.026, 0.080, 0.020], distance: 0.275 });
     let robot = space("robot hand", "robot/hand", Eye { target: [0.010, 0.020, 0.030], distance: 0.46 });
     // The lanes of a StateTimelineView stay where they were when it was opened; a plot of bands moves with the time.
-    let mode = plot("mode (above) and operator (below)", &["/robot/band", "/operator/band"], Some([-0.6, 1.6]));
+    let mode = plot("mode (above), operator connected (below)", &["/robot/band", "/operator/band"], Some([-0.6, 1.6]));
     let history = view("StateTimeline", "since the start", "/", &["/robot/mode", "/operator/connection"]);
     let joints = ["thumb", "index", "middle", "ring"]
         .map(|finger| plot(&format!("{finger} [rad]"), &[&format!("/robot/joints/{finger}")], None))
@@ -164,7 +164,7 @@ fn windowed(view: View) -> View {
         start: TimeRangeBoundary::CursorRelative(TimeInt(-WINDOW)),
         end: TimeRangeBoundary::CursorRelative(TimeInt(0)),
     };
-    let query = VisibleTimeRange(datatypes::VisibleTimeRange { timeline: TIMELINE.into(), range: window.clone() });
+    let query = VisibleTimeRange(datatypes::VisibleTimeRange { timeline: TIMELINE.into(), range: window });
     view.with("TimeAxis", &TimeAxis::new().with_view_range(window))
         .with("VisibleTimeRanges", &VisibleTimeRanges::new([query]))
 }

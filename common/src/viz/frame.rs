@@ -66,6 +66,7 @@ impl Level {
 
 /// What waits in the queue.
 #[derive(Clone, Copy, Debug)]
+#[allow(clippy::large_enum_variant, reason = "a boxed frame would allocate and free where it is logged")]
 pub(super) enum Frame {
     Operator(OperatorFrame),
     Robot(RobotFrame),

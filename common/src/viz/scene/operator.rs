@@ -53,7 +53,7 @@ impl<'a> Drawing<'a> {
         let states = [(CONNECTED, palette::finger(Finger::Index)), (ALONE, palette::FAINT)];
         let style =
             StateConfiguration::new().with_values(states.map(|state| state.0)).with_colors(states.map(|state| state.1));
-        let bands = states.map(|(name, color)| Curve::band(name, color));
+        let bands = [Curve::band("operator connected", palette::finger(Finger::Index))];
         stream.log_static("operator/connection", &style)?;
         Ok(Self {
             side,
@@ -74,8 +74,8 @@ impl<'a> Drawing<'a> {
         let connection = if frame.round_trip.is_some() { CONNECTED } else { ALONE };
         self.connection.set(frame.time, connection, stream)?;
         if self.plots.due(frame.time) {
-            let band = [CONNECTED, ALONE].map(|state| if state == connection { 0.0 } else { f64::NAN });
-            self.connection_band.push(frame.time, band, stream)?;
+            let band = if frame.round_trip.is_some() { 0.0 } else { f64::NAN };
+            self.connection_band.push(frame.time, [band], stream)?;
             let thumb = frame.pose.tip(Finger::Thumb);
             let delta = self.opposing.iter().map(|finger| (frame.pose.tip(*finger) - thumb).norm() * 1e3);
             self.delta.push(frame.time, delta, stream)?;

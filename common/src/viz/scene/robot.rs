@@ -15,6 +15,9 @@ use crate::viz::{TIMELINE, palette};
 /// The shapes of one kind: the link each sits on, and where.
 type Places = Vec<(usize, Isometry3<f64>)>;
 
+/// The modes in the order of their legend, which may be cut short.
+const BANDS: [Mode; 4] = [Mode::Engaged, Mode::Holding, Mode::Faulted, Mode::Idle];
+
 /// The robot's hand and plots.
 pub(super) struct Drawing<'a> {
     hand: &'a HandModel,
@@ -82,7 +85,7 @@ impl<'a> Drawing<'a> {
             mode: Lane::new("robot/mode"),
             mode_band: Series::new(
                 "robot/band",
-                &Mode::ALL.map(|mode| Curve::band(mode.name(), mode_color(mode))),
+                &BANDS.map(|mode| Curve::band(mode.name(), mode_color(mode))),
                 stream,
             )?,
         })
@@ -134,7 +137,7 @@ impl<'a> Drawing<'a> {
         let speeds = self.hand.fingers.iter().flat_map(|finger| &finger.joints);
         let speeds = speeds.map(|joint| frame.dq.get(joint.joint).copied().unwrap_or(f64::NAN));
         self.speed.push(time, speeds, stream)?;
-        let band = Mode::ALL.map(|mode| if mode == frame.mode { 1.0 } else { f64::NAN });
+        let band = BANDS.map(|mode| if mode == frame.mode { 1.0 } else { f64::NAN });
         self.mode_band.push(time, band, stream)?;
         let milli = |value: Option<f64>| value.map_or(f64::NAN, |value| value * 1e3);
         self.timing.push(time, [milli(frame.pose_age), milli(frame.tick)], stream)
