@@ -114,3 +114,97 @@ impl Receiver {
         &mut self.clocks[place]
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use std::time::Duration;
+
+    use teleop_common::master::{Gesture, MasterGeometry, MasterPose};
+    use teleop_common::wire::{Header, MAX_MESSAGE, encode_into};
+
+    use super::*;
+
+    const MS: u64 = 1_000_000;
+    const ROBOT: u64 = 1;
+    // The operator's clock is an hour ahead.
+    const AHEAD: u64 = 3_600_000 * MS;
+
+    fn receiver() -> (Receiver, triple_buffer::Output<Option<PoseSample>>) {
+        let params = GateParams { max_age: Duration::from_millis(250), release_after: Duration::from_millis(200) };
+        let (input, output) = triple_buffer::triple_buffer(&None);
+        (Receiver::new(ROBOT, params, input), output)
+    }
+
+    /// A pose captured and sent at `at` (ms, robot's clock) that arrives 10 ms later, as an answer to a state of the
+    /// robot that left 10 ms before.
+    fn send(receiver: &mut Receiver, epoch: u64, seq: u64, at: u64, echo: bool) {
+        let operator = |ms: u64| MonoTime(AHEAD + ms * MS);
+        let echo = if echo {
+            Echo { epoch: ROBOT, sent: MonoTime((at - 10) * MS), received: operator(at) }
+        } else {
+            Echo::NONE
+        };
+        let pose = MasterPose { q: Gesture::Open.sample(0.0), geometry: MasterGeometry::PARADIGMATIC };
+        let header = Header::new::<PoseMessage>(epoch, seq, operator(at));
+        let message = PoseMessage::new(header, echo, operator(at), &pose);
+        deliver(receiver, &message, at + 10);
+    }
+
+    fn deliver(receiver: &mut Receiver, message: &PoseMessage, at: u64) {
+        let mut buffer = [0; MAX_MESSAGE];
+        let len = encode_into(message, &mut buffer).unwrap();
+        receiver.on_pose(Arrival { payload: Ok(&buffer[..len]), at: MonoTime(at * MS) });
+    }
+
+    fn rejected(receiver: &Receiver, why: Rejection) -> u64 {
+        receiver.counts().rejected[why.index()]
+    }
+
+    #[test]
+    fn poses_pass_once_the_clock_is_known() {
+        let (mut receiver, mut slot) = receiver();
+        send(&mut receiver, 7, 1, 1000, false);
+        assert_eq!((rejected(&receiver, Rejection::Clock), slot.read().is_none()), (1, true));
+        assert_eq!(receiver.echo().epoch, 7);
+        send(&mut receiver, 7, 2, 1010, true);
+        let sample = slot.read().unwrap();
+        assert_eq!((sample.epoch, sample.sequence, sample.received), (7, 2, MonoTime(1020 * MS)));
+        // Symmetric delays: the capture is known exactly.
+        assert!(sample.captured.0.abs_diff(1010 * MS) < 1000, "{:?}", sample.captured);
+        assert_eq!(receiver.counts().accepted, 1);
+    }
+
+    #[test]
+    fn a_backlog_and_a_second_operator_are_refused() {
+        let (mut receiver, mut slot) = receiver();
+        send(&mut receiver, 7, 1, 1000, true);
+        send(&mut receiver, 8, 1, 1005, true);
+        assert_eq!(rejected(&receiver, Rejection::Operator), 1);
+        assert_eq!(receiver.echo().epoch, 7, "the driving operator keeps its echo");
+        // What was sent at 1020 .. 1080 ms comes out of some buffer 3 s later.
+        let pose = MasterPose { q: Gesture::Open.sample(0.0), geometry: MasterGeometry::PARADIGMATIC };
+        for seq in 2..6 {
+            let stamp = MonoTime(AHEAD + (1000 + seq * 20) * MS);
+            let message = PoseMessage::new(Header::new::<PoseMessage>(7, seq, stamp), Echo::NONE, stamp, &pose);
+            deliver(&mut receiver, &message, 4000 + seq);
+        }
+        assert_eq!(rejected(&receiver, Rejection::Stale), 4);
+        assert_eq!(slot.read().unwrap().sequence, 1);
+        // The first has been silent for long: the second may drive.
+        send(&mut receiver, 8, 2, 4100, true);
+        assert_eq!(slot.read().unwrap().epoch, 8);
+    }
+
+    #[test]
+    fn garbage_is_counted_and_changes_nothing() {
+        let (mut receiver, mut slot) = receiver();
+        send(&mut receiver, 7, 1, 1000, true);
+        for garbage in [&[] as &[u8], &[0; 10], &[0xff; 500], b"{\"q\": []}"] {
+            receiver.on_pose(Arrival { payload: Ok(garbage), at: MonoTime(1011 * MS) });
+        }
+        assert_eq!(rejected(&receiver, Rejection::Malformed), 4);
+        assert_eq!(slot.read().unwrap().sequence, 1);
+        send(&mut receiver, 7, 2, 1020, true);
+        assert_eq!(slot.read().unwrap().sequence, 2);
+    }
+}

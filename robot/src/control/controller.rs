@@ -60,8 +60,8 @@ pub enum Fault {
     /// None.
     #[default]
     None = 0,
-    /// The hand reported a state that is no number.
-    StateNotFinite = 1,
+    /// The hand reported a state that is no number, or of another number of joints.
+    StateInvalid = 1,
     /// The loop computed a command that is no number.
     CommandNotFinite = 2,
     /// The driver failed.
@@ -159,8 +159,9 @@ impl Controller {
     /// again it starts from there, slowly at first.
     pub fn tick(&mut self, now: MonoTime, newest: Option<&PoseSample>, state: &JointState) -> TickRecord {
         self.tick += 1;
-        if !(state.q.is_finite() && state.dq.is_finite()) {
-            self.fail(Fault::StateNotFinite);
+        let joints = self.hand().joints.len();
+        if state.q.len() != joints || state.dq.len() != joints || !state.q.is_finite() || !state.dq.is_finite() {
+            self.fail(Fault::StateInvalid);
         }
         let command = if self.mode == Mode::Faulted { None } else { self.command(now, newest, state) };
         let command = command.unwrap_or_else(|| {
