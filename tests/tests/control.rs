@@ -1,0 +1,423 @@
+//! The control core in virtual time, with the simulated hand: watchdog, limits, faults, and no allocation.
+
+#![allow(clippy::unwrap_used, reason = "helpers of tests")]
+
+use std::alloc::{GlobalAlloc, Layout, System};
+use std::cell::Cell;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex};
+use std::time::Duration;
+
+use teleop_common::hand::{HandModel, HandSide, JointVector};
+use teleop_common::mapping::MappingParams;
+use teleop_common::master::{Gesture, MasterGeometry, MasterPose};
+use teleop_common::mode::Mode;
+use teleop_common::net::Arrival;
+use teleop_common::time::MonoTime;
+use teleop_common::wire::{Echo, MAX_MESSAGE, PoseMessage, Stamper, encode_into};
+use teleop_robot::control::{ControlParams, Controller, Fault, GateParams, PoseSample, TickRecord};
+use teleop_robot::driver::{DriverError, HandDriver, JointCommand, JointState, Pace, SimHand};
+use teleop_robot::receive::Receiver;
+use teleop_robot::runtime::{ControlThread, Realtime};
+use teleop_tests::eventually;
+use teleop_tests::relay::Dice;
+
+/// Counts the allocations of each thread by itself.
+struct Counting;
+
+thread_local! {
+    static ALLOCATIONS: Cell<u64> = const { Cell::new(0) };
+}
+
+fn count() {
+    // Fails only while a thread is torn down.
+    let _gone = ALLOCATIONS.try_with(|allocations| allocations.set(allocations.get() + 1));
+}
+
+// SAFETY: passes every call on to the system's allocator as it is.
+unsafe impl GlobalAlloc for Counting {
+    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
+        count();
+        // SAFETY: the caller's promises are those that `System` asks for.
+        unsafe { System.alloc(layout) }
+    }
+
+    unsafe fn realloc(&self, pointer: *mut u8, layout: Layout, size: usize) -> *mut u8 {
+        count();
+        // SAFETY: as above.
+        unsafe { System.realloc(pointer, layout, size) }
+    }
+
+    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
+        count();
+        // SAFETY: as above.
+        unsafe { System.dealloc(pointer, layout) }
+    }
+}
+
+#[global_allocator]
+static ALLOCATOR: Counting = Counting;
+
+/// Allocations and releases of this thread while `work` runs.
+fn allocations(work: impl FnOnce()) -> u64 {
+    let before = ALLOCATIONS.get();
+    work();
+    ALLOCATIONS.get() - before
+}
+
+const MS: u64 = 1_000_000;
+const RATE: f64 = 333.0;
+const PERIOD: Duration = Duration::from_nanos(3_003_003);
+const HOLD_AFTER: Duration = Duration::from_millis(200);
+
+/// A controller and a simulated hand that tick in virtual time.
+struct Bench {
+    hand: HandModel,
+    controller: Controller,
+    driver: SimHand,
+    now: MonoTime,
+}
+
+impl Bench {
+    fn new(side: HandSide, mapping: MappingParams) -> Self {
+        let hand = HandModel::allegro_v4(side);
+        let params = ControlParams { rate: RATE, hold_after: HOLD_AFTER, ..ControlParams::default() };
+        let mut driver = SimHand::new(&hand, 1.0 / RATE);
+        driver.start().unwrap();
+        let controller = Controller::new(hand.clone(), mapping, params).unwrap();
+        Self { hand, controller, driver, now: MonoTime(MS) }
+    }
+
+    fn right() -> Self {
+        Self::new(HandSide::Right, MappingParams::default())
+    }
+
+    fn tick(&mut self, newest: Option<&PoseSample>) -> TickRecord {
+        self.now = self.now + PERIOD;
+        let state = self.driver.read(Duration::ZERO).unwrap();
+        let record = self.controller.tick(self.now, newest, &state);
+        self.driver.write(&record.command).unwrap();
+        record
+    }
+
+    /// A pose that arrives now.
+    fn sample(&self, pose: MasterPose, sequence: u64) -> PoseSample {
+        PoseSample {
+            pose,
+            epoch: 7,
+            sequence,
+            captured_remote: self.now,
+            captured: self.now,
+            received: self.now,
+        }
+    }
+}
+
+fn pose(gesture: Gesture, t: f64) -> MasterPose {
+    MasterPose { q: gesture.sample(t), geometry: MasterGeometry::PARADIGMATIC }
+}
+
+/// Speed between two commands (rad/s), of the fastest joint.
+fn speed(before: &TickRecord, after: &TickRecord) -> f64 {
+    let pairs = before.command.q.iter().zip(after.command.q.iter());
+    pairs.fold(0.0, |most: f64, (a, b)| most.max((b - a).abs() * RATE))
+}
+
+#[test]
+fn a_tick_does_not_allocate() {
+    const ROBOT: u64 = 1;
+    /// The operator's clock, from this one's.
+    const AHEAD: u64 = 3_600_000 * MS;
+    let mut bench = Bench::right();
+    let (input, mut slot) = triple_buffer::triple_buffer(&None);
+    let gate = GateParams { max_age: Duration::from_millis(250), release_after: HOLD_AFTER };
+    let mut receiver = Receiver::new(ROBOT, gate, input);
+    let mut operator = Stamper::new(100);
+    let mut modes = [0_u64; Mode::ALL.len()];
+    let mut run = |ticks: u64| {
+        for tick in 0..ticks {
+            // Every so often the operator falls silent for 0.33 s; every other time it comes back as a new process.
+            let phase = tick % 4000;
+            if phase == 3999 && (tick / 4000) % 2 == 0 {
+                operator = Stamper::new(100 + tick);
+            }
+            if phase < 3890 && tick % 3 == 0 {
+                // Poses and their answers take 2 ms each way.
+                let (sent, arrives) = (bench.now.0, bench.now.0 + 2 * MS);
+                let echo = Echo { epoch: ROBOT, sent: MonoTime(sent - 3 * MS), received: MonoTime(sent - MS + AHEAD) };
+                let header = operator.header::<PoseMessage>(MonoTime(sent + AHEAD));
+                let pose = pose(Gesture::Tour, tick as f64 / RATE);
+                let message = PoseMessage::new(header, echo, MonoTime(sent + AHEAD), &pose);
+                let mut bytes = [0; MAX_MESSAGE];
+                let len = encode_into(&message, &mut bytes).unwrap();
+                receiver.on_pose(Arrival { payload: Ok(&bytes[..len]), at: MonoTime(arrives) });
+                // And what is no pose.
+                receiver.on_pose(Arrival { payload: Ok(&bytes[..len - 1]), at: MonoTime(arrives) });
+            }
+            let record = bench.tick(slot.read().as_ref());
+            modes[record.mode as usize] += 1;
+        }
+    };
+    run(2000);
+    let ticks = 100_000;
+    let count = allocations(|| run(ticks));
+    println!("{ticks} ticks with receiving, decoding and the simulated hand: {count} allocations; modes {modes:?}");
+    assert_eq!(count, 0);
+    // It was the real thing: followed, held, and followed again.
+    assert!(modes[Mode::Engaged as usize] > 90_000 && modes[Mode::Holding as usize] > 500, "{modes:?}");
+    assert_eq!(modes[Mode::Faulted as usize], 0);
+    assert!(receiver.counts().accepted > 30_000, "{:?}", receiver.counts().rejected);
+    // And the counter counts.
+    assert!(allocations(|| drop(std::hint::black_box(Box::new(1)))) >= 2);
+}
+
+#[test]
+fn the_watchdog_holds_within_a_tick() {
+    let mut bench = Bench::right();
+    let (mut sample, mut engaged) = (None, 0);
+    for tick in 0..600 {
+        if tick % 3 == 0 {
+            sample = Some(bench.sample(pose(Gesture::Wave, f64::from(tick) / RATE), tick as u64));
+        }
+        engaged += u32::from(bench.tick(sample.as_ref()).mode == Mode::Engaged);
+    }
+    assert_eq!(engaged, 600);
+    let received = sample.unwrap().received;
+    // The same pose again and again is no fresh pose.
+    let first = loop {
+        let record = bench.tick(sample.as_ref());
+        if record.mode != Mode::Engaged {
+            break record;
+        }
+        assert!(record.now.since(received) <= HOLD_AFTER);
+    };
+    assert_eq!((first.mode, first.holds), (Mode::Holding, 1));
+    let silent = first.now.since(received);
+    assert!(silent > HOLD_AFTER && silent <= HOLD_AFTER + PERIOD, "{silent:?}");
+
+    // It brakes within 7 / 120 s, then the command is exactly still and the hand comes to rest.
+    for _ in 0..20 {
+        bench.tick(sample.as_ref());
+    }
+    let still = bench.tick(None).command;
+    for _ in 0..2000 {
+        let command = bench.tick(sample.as_ref()).command;
+        assert_eq!((command.q, command.dq), (still.q, still.dq));
+    }
+    assert!(still.dq.iter().all(|dq| *dq == 0.0));
+    let rest = bench.tick(None).state;
+    assert!(rest.dq.iter().all(|dq| dq.abs() < 1e-9), "{:?}", rest.dq);
+    // Coulomb friction of 0.01 N m against a gain of 0.6 N m/rad leaves up to 17 mrad.
+    assert!(rest.q.iter().zip(still.q.iter()).all(|(q, command)| (q - command).abs() < 0.02), "{rest:?}");
+}
+
+#[test]
+fn it_resumes_without_a_jump() {
+    let mut bench = Bench::right();
+    for tick in 0..700_u32 {
+        let sample = bench.sample(pose(Gesture::Fist, f64::from(tick) / RATE), tick.into());
+        bench.tick(Some(&sample));
+    }
+    let mut before = bench.tick(None);
+    for _ in 0..300 {
+        before = bench.tick(None);
+    }
+    assert_eq!(before.mode, Mode::Holding);
+    // The operator comes back with another posture altogether.
+    let limits = bench.hand.joints[0].acceleration;
+    let mut last = 0.0;
+    let mut farthest: f64 = 0.0;
+    let start = before;
+    for tick in 0..600_u32 {
+        let sample = bench.sample(pose(Gesture::Open, 0.0), 1000 + u64::from(tick));
+        let record = bench.tick(Some(&sample));
+        assert_eq!(record.mode, Mode::Engaged);
+        let speed = speed(&before, &record);
+        let ramp = 1.0 + 9.0 * f64::from(tick) / RATE;
+        assert!(speed <= ramp.min(7.0) + 1e-9, "{speed} rad/s at tick {tick}");
+        assert!(speed <= last + limits / RATE + 1e-9, "from {last} to {speed} rad/s at tick {tick}");
+        farthest = farthest.max(record.command.q.iter().zip(start.command.q.iter()).map(|(a, b)| (a - b).abs()).sum());
+        (before, last) = (record, speed);
+    }
+    assert!(farthest > 3.0, "it hardly moved: {farthest} rad");
+    let target = before.mapping.unwrap().q;
+    assert!(before.command.q.iter().zip(target.iter()).all(|(a, b)| (a - b).abs() < 1e-3), "it never arrived");
+}
+
+/// A pose as far from a hand's as [`MasterPose::validate`] lets pass.
+fn any_pose(dice: &mut Dice) -> MasterPose {
+    let mut roll = |low: f64, high: f64| low + (high - low) * dice.roll();
+    let wild = roll(0.0, 1.0) < 0.5;
+    let reach = if wild { std::f64::consts::TAU } else { 2.0 };
+    let mut pose = MasterPose { q: [0.0; 20], geometry: MasterGeometry::PARADIGMATIC };
+    for angle in &mut pose.q {
+        *angle = roll(-reach, reach);
+    }
+    if wild {
+        for phalanx in pose.geometry.phalanges.iter_mut().flatten() {
+            *phalanx = roll(0.003, 0.150);
+        }
+        let mut x = roll(0.02, 0.10);
+        for base in &mut pose.geometry.bases {
+            *base = [x, roll(-0.1, 0.15), roll(-0.1, 0.1)];
+            x -= roll(0.0011, 0.03);
+        }
+    }
+    pose
+}
+
+#[test]
+fn no_stream_of_poses_breaks_a_limit() {
+    for (side, mapping, seed) in
+        [(HandSide::Right, MappingParams::default(), 1), (HandSide::Left, MappingParams::paper(), 2)]
+    {
+        let mut bench = Bench::new(side, mapping);
+        let mut dice = Dice::new(seed, 0);
+        let (mut sample, mut sequence, mut wait) = (None, 0, 0_u64);
+        let (mut before, mut velocity) = (bench.tick(None), JointVector::zeros(16));
+        let (mut fastest, mut holds, mut valid) = (0.0_f64, 0, 0);
+        for _ in 0..100_000_u32 {
+            if wait == 0 {
+                let pose = any_pose(&mut dice);
+                if pose.validate().is_ok() {
+                    (valid, sequence) = (valid + 1, sequence + 1);
+                    sample = Some(bench.sample(pose, sequence));
+                }
+                // Mostly a stream; sometimes a gap, of up to a second.
+                let gap = dice.roll();
+                wait = if gap < 0.005 { (dice.roll() * 333.0) as u64 } else { (dice.roll() * 12.0) as u64 };
+            }
+            wait = wait.saturating_sub(1);
+            if dice.roll() < 0.001 {
+                // The machine stalls.
+                bench.now = bench.now + Duration::from_millis((dice.roll() * 300.0) as u64);
+            }
+            let record = bench.tick(sample.as_ref());
+            assert!(matches!(record.mode, Mode::Engaged | Mode::Holding), "{record:?}");
+            for (slot, joint) in bench.hand.joints.iter().enumerate() {
+                let (q, tau) = (record.command.q[slot], record.command.tau[slot]);
+                assert!((joint.lower..=joint.upper).contains(&q), "{} at {q}", joint.name);
+                assert!(tau.abs() <= joint.torque, "{} with {tau} N m", joint.name);
+                let moving = (q - before.command.q[slot]) * RATE;
+                assert!(moving.abs() <= joint.velocity * (1.0 + 1e-9), "{} at {moving} rad/s", joint.name);
+                let change = (moving - velocity[slot]).abs() * RATE;
+                assert!(change <= joint.acceleration * (1.0 + 1e-6), "{} at {change} rad/s²", joint.name);
+                let measured = record.state.q[slot];
+                assert!((joint.lower..=joint.upper).contains(&measured), "{} measured at {measured}", joint.name);
+                velocity[slot] = moving;
+                fastest = fastest.max(moving.abs());
+            }
+            (before, holds) = (record, record.holds);
+        }
+        println!("{}: {valid} poses, {holds} holds, fastest {fastest:.2} rad/s", side.name());
+        assert!(valid > 10_000 && holds > 20 && fastest > 6.9, "{valid} poses, {holds} holds, {fastest} rad/s");
+    }
+}
+
+/// Expects that the hand is off and stays off, whatever comes.
+#[track_caller]
+fn assert_off(bench: &mut Bench, fault: Fault) {
+    for tick in 0..500_u32 {
+        let sample = bench.sample(pose(Gesture::Wave, f64::from(tick) / RATE), 5000 + u64::from(tick));
+        let record = bench.tick(Some(&sample));
+        assert_eq!((record.mode, record.fault), (Mode::Faulted, fault));
+        assert!(record.command.tau.iter().all(|tau| *tau == 0.0) && record.command.q.is_finite());
+    }
+}
+
+#[test]
+fn faults_take_the_torque_off_for_good() {
+    let broken = |change: fn(&mut JointState)| {
+        let mut bench = Bench::right();
+        for tick in 0..400_u32 {
+            let sample = bench.sample(pose(Gesture::Wave, f64::from(tick) / RATE), tick.into());
+            bench.tick(Some(&sample));
+        }
+        let mut state = bench.driver.read(Duration::ZERO).unwrap();
+        change(&mut state);
+        let sample = bench.sample(pose(Gesture::Wave, 1.3), 1000);
+        let record = bench.controller.tick(bench.now + PERIOD, Some(&sample), &state);
+        assert_eq!((record.mode, record.fault), (Mode::Faulted, Fault::StateInvalid));
+        assert!(record.command.tau.iter().all(|tau| *tau == 0.0), "{:?}", record.command.tau);
+        // A hand with a position controller of its own must not get it either.
+        assert!(record.command.q.is_finite() && record.command.dq.is_finite(), "{:?}", record.command);
+        assert_off(&mut bench, Fault::StateInvalid);
+    };
+    broken(|state| state.q[3] = f64::NAN);
+    broken(|state| state.dq[15] = f64::INFINITY);
+    broken(|state| state.q = JointVector::zeros(15));
+
+    let mut bench = Bench::right();
+    bench.tick(None);
+    bench.controller.fail(Fault::Driver);
+    bench.controller.fail(Fault::CommandNotFinite);
+    assert_off(&mut bench, Fault::Driver);
+}
+
+/// A hand that is unplugged after some reads.
+struct Unplugged {
+    hand: SimHand,
+    reads: u32,
+    stops: Arc<AtomicU64>,
+    written: Arc<Mutex<Vec<JointCommand>>>,
+}
+
+impl HandDriver for Unplugged {
+    fn name(&self) -> &'static str {
+        "hand that is unplugged"
+    }
+
+    fn pace(&self) -> Pace {
+        Pace::Loop
+    }
+
+    fn start(&mut self) -> Result<(), DriverError> {
+        self.hand.start()
+    }
+
+    fn read(&mut self, timeout: Duration) -> Result<JointState, DriverError> {
+        self.reads = self.reads.checked_sub(1).ok_or(DriverError::Disconnected)?;
+        self.hand.read(timeout)
+    }
+
+    fn write(&mut self, command: &JointCommand) -> Result<(), DriverError> {
+        self.written.lock().unwrap().push(*command);
+        self.hand.write(command)
+    }
+
+    fn stop(&mut self) {
+        self.stops.fetch_add(1, Ordering::Relaxed);
+        self.hand.stop();
+    }
+}
+
+#[test]
+fn a_driver_that_fails_is_stopped_and_told() {
+    let hand = HandModel::allegro_v4(HandSide::Right);
+    let (stops, written) = (Arc::<AtomicU64>::default(), Arc::<Mutex<Vec<_>>>::default());
+    let driver = Unplugged {
+        hand: SimHand::new(&hand, 1.0 / RATE),
+        reads: 50,
+        stops: Arc::clone(&stops),
+        written: Arc::clone(&written),
+    };
+    let controller = Controller::new(hand, MappingParams::default(), ControlParams::default()).unwrap();
+    let (control, mut link) = ControlThread::start(controller, Box::new(driver), RATE, Realtime::Off).unwrap();
+    let mut records = Vec::new();
+    eventually("the loop has gone on for a while", || {
+        while let Ok(record) = link.records.pop() {
+            records.push(record);
+        }
+        records.len() > 150
+    });
+    assert!(control.is_running(), "the loop goes on, to tell of the fault");
+    let failed = records.iter().position(|record| record.record.mode == Mode::Faulted).unwrap();
+    assert_eq!(failed, 50);
+    for record in &records[failed..] {
+        assert_eq!((record.record.mode, record.record.fault), (Mode::Faulted, Fault::Driver));
+        assert_eq!(record.driver_error, Some(DriverError::Disconnected));
+        assert!(record.record.command.tau.iter().all(|tau| *tau == 0.0));
+    }
+    assert_eq!(written.lock().unwrap().len(), 50, "nothing is written to a hand that failed");
+    assert!(stops.load(Ordering::Relaxed) >= 1);
+}
