@@ -45,6 +45,23 @@ mod tests {
     use super::*;
 
     #[test]
+    fn both_hands_are_seen_from_the_palm_with_the_fingers_up() {
+        for (side, thumb_side) in [(HandSide::Right, 1.0), (HandSide::Left, -1.0)] {
+            let hand = HandModel::allegro_v4(side);
+            let turn = from_palm(&hand);
+            let [thumb, middle] = [0, 2].map(|i| {
+                let finger = &hand.fingers[i];
+                turn * finger.tip(&finger.select(&hand.home()), crate::hand::TipFrame::Pole)
+            });
+            assert!(middle.y > 0.1 && thumb.y < middle.y, "{side:?}: {middle}");
+            assert!((thumb.x - middle.x) * thumb_side > 0.05, "{side:?}: {thumb} {middle}");
+            let palmar = turn * (hand.anatomical_from_palm.transpose() * Vector3::z());
+            assert!((palmar - Vector3::z()).norm() < 1e-9, "{side:?}: {palmar}");
+            assert!(from_master(&Vector3::x(), side).x * thumb_side > 0.0);
+        }
+    }
+
+    #[test]
     fn along_turns_z_into_any_direction() {
         for direction in [Vector3::x(), -Vector3::z(), Vector3::z(), Vector3::new(1.0, -2.0, 0.5)] {
             let turned = along(&direction) * Vector3::z();
