@@ -1,6 +1,5 @@
 //! The program: logging, signals, exit codes, and which command runs.
 
-use std::process::ExitCode;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -8,10 +7,10 @@ use anyhow::{Context as _, anyhow};
 use teleop_common::key::Keys;
 use teleop_common::master::Gesture;
 use teleop_common::net::clock::random_epoch;
-use teleop_common::net::{NetError, Session, SessionConfig};
 
 use crate::calibrate;
 use crate::cli::{Cli, Command, LogArgs, WatchArgs};
+use crate::failure::{Failure, OrFail as _, open_session};
 use crate::feedback::{Feedback, subscribe};
 use crate::run::run;
 use crate::shutdown::Shutdown;
@@ -20,50 +19,6 @@ use crate::watch::{WatchOptions, watch};
 
 /// Default log filter. zenoh and Rerun warn of settings that are meant; what matters of them shows in the status line.
 const LOG_FILTER: &str = "info,zenoh=error,re_=error,rerun=error";
-
-/// Why the program ends other than well.
-#[derive(Debug)]
-pub enum Failure {
-    /// It was asked for something that cannot be.
-    Usage(anyhow::Error),
-    /// It failed while running.
-    Runtime(anyhow::Error),
-}
-
-impl Failure {
-    /// 2 for wrong usage or configuration, 1 for the rest.
-    #[must_use]
-    pub fn exit_code(&self) -> ExitCode {
-        ExitCode::from(match self {
-            Self::Usage(_) => 2,
-            Self::Runtime(_) => 1,
-        })
-    }
-}
-
-impl std::fmt::Display for Failure {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let (Self::Usage(error) | Self::Runtime(error)) = self;
-        error.fmt(f)
-    }
-}
-
-pub(crate) trait OrFail<T> {
-    /// The failure is in what the user asked for.
-    fn or_usage(self) -> Result<T, Failure>;
-    /// The failure came while running.
-    fn or_runtime(self) -> Result<T, Failure>;
-}
-
-impl<T, E: Into<anyhow::Error>> OrFail<T> for Result<T, E> {
-    fn or_usage(self) -> Result<T, Failure> {
-        self.map_err(|error| Failure::Usage(error.into()))
-    }
-
-    fn or_runtime(self) -> Result<T, Failure> {
-        self.map_err(|error| Failure::Runtime(error.into()))
-    }
-}
 
 /// Runs the program.
 ///
@@ -147,17 +102,6 @@ fn gestures() {
     for gesture in Gesture::ALL {
         say(&format!("{gesture:<18} {:>6.1} s  {}", gesture.duration(), gesture.description())).ok();
     }
-}
-
-/// Opens a session; a bad endpoint is wrong usage, a taken port is not.
-pub(crate) fn open_session(connect: &[String], listen: &[String]) -> Result<Session, Failure> {
-    let config = SessionConfig { connect: connect.to_vec(), listen: listen.to_vec(), ..SessionConfig::default() };
-    Session::open(&config).map_err(|error| match error {
-        NetError::Endpoint { .. } | NetError::Setting { .. } | NetError::ConfigFile { .. } => {
-            Failure::Usage(error.into())
-        }
-        error => Failure::Runtime(error.into()),
-    })
 }
 
 fn watch_robot(args: &WatchArgs, shutdown: &Shutdown) -> Result<(), Failure> {

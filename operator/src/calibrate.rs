@@ -8,8 +8,8 @@ use teleop_common::key::Keys;
 use teleop_common::master::{Calibration, Calibrator, SideVerdict};
 use teleop_common::recording::FrameData;
 
-use crate::app::{Failure, OrFail as _, open_session};
 use crate::cli::CalibrateArgs;
+use crate::failure::{Failure, OrFail as _, open_session};
 use crate::shutdown::Shutdown;
 use crate::source::{Poll, RecordingFile, Source, SourceSpec, ZenohSource};
 use crate::terminal::say;

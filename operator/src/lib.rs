@@ -12,12 +12,13 @@
 //! | [`run`] | `operator run`: the wiring of the above |
 //! | [`calibrate`] | `operator calibrate` |
 //! | [`watch`] | `operator watch` |
-//! | [`shutdown`] | ending in order |
-//! | [`cli`], [`app`] | the command line; logging, signals, exit codes |
+//! | [`shutdown`], [`failure`] | ending in order; ending otherwise, with its exit code |
+//! | [`cli`], [`app`] | the command line; logging, signals |
 
 pub mod app;
 pub mod calibrate;
 pub mod cli;
+pub mod failure;
 pub mod feedback;
 pub mod hand;
 pub mod pipeline;

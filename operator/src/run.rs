@@ -12,9 +12,9 @@ use teleop_common::net::clock::{now, random_epoch};
 use teleop_common::net::{Session, Stream};
 use teleop_common::viz::{Level, Scene, Viz};
 
-use crate::app::{Failure, OrFail as _, open_session};
 use crate::calibrate;
 use crate::cli::RunArgs;
+use crate::failure::{Failure, OrFail as _, open_session};
 use crate::feedback::{Feedback, subscribe};
 use crate::hand::PoseFinder;
 use crate::pipeline::{Parts, Pipeline, Progress, picture_time};

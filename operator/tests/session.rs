@@ -328,7 +328,7 @@ fn live_keypoints_are_measured_first_and_then_followed() {
 fn failures_before_anything_runs_are_told_apart() {
     let fail = |line: &str| {
         let failure = run(&args(line), &Shutdown::default(), &Terminal::new()).unwrap_err();
-        (format!("{failure:#}"), matches!(failure, teleop_operator::app::Failure::Usage(_)))
+        (format!("{failure:#}"), matches!(failure, teleop_operator::failure::Failure::Usage(_)))
     };
     let taken = TcpListener::bind("127.0.0.1:0").unwrap();
     let taken = format!("--source zenoh --listen tcp/127.0.0.1:{}", taken.local_addr().unwrap().port());

@@ -10,7 +10,7 @@ use std::time::Duration;
 use anyhow::Context as _;
 use teleop_common::hand::{FingerChain, HandModel, Joint};
 use teleop_common::key::Keys;
-use teleop_common::net::{NetError, Session, SessionConfig, clock};
+use teleop_common::net::{Session, SessionConfig, clock};
 use teleop_common::viz::{Hub, HubOptions, Scene, Viz};
 use teleop_common::wire;
 
@@ -21,6 +21,7 @@ use crate::driver::SimHand;
 use crate::receive::Receiver;
 use crate::runtime::{ControlThread, LoopRecord};
 use crate::telemetry::Telemetry;
+use crate::usage::{UsageError, is_usage};
 
 /// How long the telemetry thread sleeps between looks at the ring of records.
 const TELEMETRY_PERIOD: Duration = Duration::from_millis(3);
@@ -28,15 +29,13 @@ const TELEMETRY_PERIOD: Duration = Duration::from_millis(3);
 /// Runs what the command line asks for. Errors are printed here, once.
 #[must_use]
 pub fn main(cli: Cli) -> ExitCode {
-    let (log, result) = match cli.command {
-        None => (cli.run.log.clone(), Ok(Command::Run(cli.run))),
-        Some(command) => match &command {
-            Command::Run(args) => (args.log.clone(), Ok(command)),
-            Command::Retarget(args) => (args.log.clone(), Ok(command)),
-            Command::Viewer(args) => (args.log.clone(), Ok(command)),
-        },
+    let command = cli.command.unwrap_or(Command::Run(cli.run));
+    let log = match &command {
+        Command::Run(args) => &args.log,
+        Command::Retarget(args) => &args.log,
+        Command::Viewer(args) => &args.log,
     };
-    let result = start_logging(&log).and(result).and_then(|command| match command {
+    let result = start_logging(log).and_then(|()| match command {
         Command::Run(args) => run(&args),
         Command::Retarget(args) => crate::retarget::run(&args),
         Command::Viewer(args) => view(&args),
@@ -50,18 +49,6 @@ pub fn main(cli: Cli) -> ExitCode {
         }
     }
 }
-
-fn is_usage(cause: &(dyn std::error::Error + 'static)) -> bool {
-    let of_endpoint = |error: &NetError| {
-        matches!(error, NetError::Endpoint { .. } | NetError::Setting { .. } | NetError::ConfigFile { .. })
-    };
-    cause.is::<ConfigError>() || cause.is::<UsageError>() || cause.downcast_ref().is_some_and(of_endpoint)
-}
-
-/// Something on the command line that cannot be used.
-#[derive(Debug, thiserror::Error)]
-#[error("{0}")]
-pub struct UsageError(pub String);
 
 fn start_logging(args: &LogArgs) -> anyhow::Result<()> {
     use tracing_subscriber::EnvFilter;

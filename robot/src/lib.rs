@@ -10,6 +10,7 @@
 //! | [`retarget`] | whole recordings offline |
 //! | [`config`] | configuration, checked |
 //! | [`cli`], [`app`] | command line; wiring and shutdown |
+//! | [`usage`] | what is wrong usage, for the exit code |
 
 pub mod app;
 pub mod cli;
@@ -20,3 +21,4 @@ pub mod receive;
 pub mod retarget;
 pub mod runtime;
 pub mod telemetry;
+pub mod usage;

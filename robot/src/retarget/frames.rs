@@ -11,7 +11,7 @@ use teleop_common::hand::HandSide;
 use teleop_common::master::{Calibration, Calibrator, Fitter, MasterGeometry, MasterPose};
 use teleop_common::recording::{FrameData, LastLine, RecordingReader};
 
-use crate::app::UsageError;
+use crate::usage::UsageError;
 
 /// Reads a recording and fits a hand to its keypoints.
 pub(super) struct Frames {

@@ -1,0 +1,60 @@
+//! Why the program ends other than well, and its exit code.
+
+use std::process::ExitCode;
+
+use teleop_common::net::{NetError, Session, SessionConfig};
+
+/// Why the program ends other than well.
+#[derive(Debug)]
+pub enum Failure {
+    /// It was asked for something that cannot be.
+    Usage(anyhow::Error),
+    /// It failed while running.
+    Runtime(anyhow::Error),
+}
+
+impl Failure {
+    /// 2 for wrong usage or configuration, 1 for the rest.
+    #[must_use]
+    pub fn exit_code(&self) -> ExitCode {
+        ExitCode::from(match self {
+            Self::Usage(_) => 2,
+            Self::Runtime(_) => 1,
+        })
+    }
+}
+
+impl std::fmt::Display for Failure {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let (Self::Usage(error) | Self::Runtime(error)) = self;
+        error.fmt(f)
+    }
+}
+
+pub(crate) trait OrFail<T> {
+    /// The failure is in what the user asked for.
+    fn or_usage(self) -> Result<T, Failure>;
+    /// The failure came while running.
+    fn or_runtime(self) -> Result<T, Failure>;
+}
+
+impl<T, E: Into<anyhow::Error>> OrFail<T> for Result<T, E> {
+    fn or_usage(self) -> Result<T, Failure> {
+        self.map_err(|error| Failure::Usage(error.into()))
+    }
+
+    fn or_runtime(self) -> Result<T, Failure> {
+        self.map_err(|error| Failure::Runtime(error.into()))
+    }
+}
+
+/// Opens a session; a bad endpoint is wrong usage, a taken port is not.
+pub(crate) fn open_session(connect: &[String], listen: &[String]) -> Result<Session, Failure> {
+    let config = SessionConfig { connect: connect.to_vec(), listen: listen.to_vec(), ..SessionConfig::default() };
+    Session::open(&config).map_err(|error| match error {
+        NetError::Endpoint { .. } | NetError::Setting { .. } | NetError::ConfigFile { .. } => {
+            Failure::Usage(error.into())
+        }
+        error => Failure::Runtime(error.into()),
+    })
+}
