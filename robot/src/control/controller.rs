@@ -79,7 +79,7 @@ pub struct TickRecord {
     pub mode: Mode,
     /// Fault, if [`Mode::Faulted`].
     pub fault: Fault,
-    /// State of the hand before the tick.
+    /// State of the hand before the tick; the last valid one, if the hand reported one that is not.
     pub state: JointState,
     /// What was commanded.
     pub command: JointCommand,
@@ -102,6 +102,8 @@ pub struct Controller {
     engaged_at: MonoTime,
     sample: Option<PoseSample>,
     mapping: Option<MappingOutput>,
+    // The last valid state of the hand.
+    state: JointState,
     tick: u64,
     holds: u64,
 }
@@ -112,6 +114,8 @@ impl Controller {
     /// # Errors
     /// A mapping parameter that cannot be used.
     pub fn new(hand: HandModel, mapping: MappingParams, params: ControlParams) -> Result<Self, ParamError> {
+        let still = JointVector::zeros(hand.joints.len());
+        let state = JointState { q: hand.home(), dq: still, tau: still };
         Ok(Self {
             params,
             retargeter: Retargeter::new(hand, mapping)?,
@@ -121,6 +125,7 @@ impl Controller {
             engaged_at: MonoTime(0),
             sample: None,
             mapping: None,
+            state,
             tick: 0,
             holds: 0,
         })
@@ -160,20 +165,25 @@ impl Controller {
     pub fn tick(&mut self, now: MonoTime, newest: Option<&PoseSample>, state: &JointState) -> TickRecord {
         self.tick += 1;
         let joints = self.hand().joints.len();
-        if state.q.len() != joints || state.dq.len() != joints || !state.q.is_finite() || !state.dq.is_finite() {
+        let valid = |values: &JointVector| values.len() == joints && values.is_finite();
+        if valid(&state.q) && valid(&state.dq) && valid(&state.tau) {
+            self.state = *state;
+        } else {
+            // What is no number must reach neither the hand nor the network.
             self.fail(Fault::StateInvalid);
         }
-        let command = if self.mode == Mode::Faulted { None } else { self.command(now, newest, state) };
+        let state = self.state;
+        let command = if self.mode == Mode::Faulted { None } else { self.command(now, newest, &state) };
         let command = command.unwrap_or_else(|| {
             self.fail(Fault::CommandNotFinite);
-            JointCommand::limp(state)
+            JointCommand::limp(&state)
         });
         TickRecord {
             tick: self.tick,
             now,
             mode: self.mode,
             fault: self.fault,
-            state: *state,
+            state,
             command,
             sample: self.sample,
             mapping: self.mapping,
