@@ -163,15 +163,6 @@ impl Probe {
         eventually("the hand moves", || moved(&self.since(mark), angle) >= 3);
     }
 
-    /// The operators' liveliness tokens.
-    ///
-    /// # Panics
-    /// If they cannot be asked for.
-    #[must_use]
-    pub fn operators(&self) -> Vec<String> {
-        self.session.live_now(&self.keys.live_operators(), Duration::from_secs(5)).unwrap()
-    }
-
     /// The robots' liveliness tokens.
     ///
     /// # Panics

@@ -102,14 +102,7 @@ impl Bench {
 
     /// A pose that arrives now.
     fn sample(&self, pose: MasterPose, sequence: u64) -> PoseSample {
-        PoseSample {
-            pose,
-            epoch: 7,
-            sequence,
-            captured_remote: self.now,
-            captured: self.now,
-            received: self.now,
-        }
+        PoseSample { pose, epoch: 7, sequence, captured_remote: self.now, captured: self.now, received: self.now }
     }
 }
 

@@ -9,7 +9,7 @@ use std::time::Duration;
 use teleop_common::hand::{HandModel, HandSide};
 use teleop_common::master::{Gesture, MasterGeometry, MasterPose};
 use teleop_common::mode::Mode;
-use teleop_common::net::{Stream, clock};
+use teleop_common::net::{Session, SessionConfig, Stream, clock};
 use teleop_common::time::MonoTime;
 use teleop_common::wire::{Echo, MAX_MESSAGE, PoseMessage, Rejection, Stamper, encode_into};
 use teleop_tests::judge::{Extremes, assert_limits, commands, spread};
@@ -99,11 +99,17 @@ fn signals_end_both_cleanly() {
     for signal in [Signal::Term, Signal::Int] {
         let mut robot = Robot::start(&[]);
         let probe = Probe::connect(robot.endpoint());
-        let mut operator = Process::operator(robot.endpoint(), "fist", &[]);
+        // Tokens show to those that a process is connected with: this test listens for the operator's.
+        let listener = Session::open(&SessionConfig::listening(["tcp/127.0.0.1:0"])).unwrap();
+        let here = listener.locators().remove(0);
+        let mut operator = Process::operator(robot.endpoint(), "fist", &["--connect", &here]);
+        let operators = || listener.live_now(&probe.keys.live_operators(), PATIENCE).unwrap();
         probe.wait_for(Mode::Engaged);
-        eventually("both are alive", || probe.operators().len() == 1 && probe.robots().len() == 1);
+        eventually("both are alive", || operators().len() == 1 && probe.robots().len() == 1);
+        let epoch = probe.last().map(|state| state.pose_epoch);
+        assert_eq!(probe.keys.live_epoch(&operators()[0]), epoch, "the token names the one that is followed");
         operator.stop(signal);
-        eventually("the operator's token is gone", || probe.operators().is_empty());
+        eventually("the operator's token is gone", || operators().is_empty());
         let holding = probe.wait_for(Mode::Holding);
         probe.wait_for_more(80);
         assert_still(&probe.since(holding));
@@ -325,7 +331,7 @@ fn exit_codes_and_messages() {
         ("robot", &["--listen", "127.0.0.1:7447"], 2, &["\"127.0.0.1:7447\"", "tcp/127.0.0.1:7447"]),
         ("robot", &["--zenoh", &missing], 2, &[&missing]),
         ("robot", &["--viewer", "screen"], 2, &["\"screen\"", "off"]),
-        ("robot", &["--duration", "-1"], 2, &["--duration", "-1"]),
+        ("robot", &["--duration", "0"], 2, &["'0'", "seconds above 0"]),
         ("robot", &["fly"], 2, &["fly"]),
         ("robot", &["--listen", busy, "--viewer", "off"], 1, &[busy, "another"]),
         ("operator", &["--rate", "0"], 2, &["'0'", "1 to 1000 Hz"]),
