@@ -176,14 +176,16 @@ fn serve_page(options: &HubOptions) -> Result<(Box<dyn Any + Send>, String), Hub
 }
 
 fn server_options(options: &HubOptions) -> ServerOptions {
-    // Bound to more than this machine, the page is opened under names we do not know.
-    let cors = if options.bind.is_loopback() { Vec::new() } else { vec!["http://*".to_owned()] };
+    // Rerun knows localhost and 127.0.0.1 of the pages that may ask. Bound to more than this machine, the page is opened
+    // under names we do not know.
+    let cors =
+        if options.bind.is_loopback() { format!("http://{}:*", host(options.bind)) } else { "http://*".to_owned() };
     ServerOptions {
         memory_limit: MemoryLimit::from_bytes(HISTORY),
         // Newest first would let live data overtake the layout and all that is static, for as long as a slow browser
         // cannot keep up with it.
         playback_behavior: PlaybackBehavior::OldestFirst,
-        cors_allowed_origins: cors,
+        cors_allowed_origins: vec![cors],
     }
 }
 
