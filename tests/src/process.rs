@@ -223,7 +223,7 @@ impl Drop for Process {
 pub struct Robot {
     /// The process.
     pub process: Process,
-    /// Where operators connect, in the order of `--listen`.
+    /// Where operators connect, by protocol in the order of `--listen`.
     pub endpoints: Vec<String>,
 }
 
@@ -258,6 +258,9 @@ impl Robot {
             !found.is_empty()
         });
         assert_eq!(found.len(), endpoints.len(), "{found:?}");
+        // The robot lists them in any order.
+        let protocol = |endpoint: &str| endpoint.split('/').next().unwrap_or_default().to_owned();
+        found.sort_by_key(|found| endpoints.iter().position(|asked| protocol(asked) == protocol(found)));
         Self { process, endpoints: found }
     }
 

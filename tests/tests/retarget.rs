@@ -108,7 +108,8 @@ fn assert_near(what: &str, a: f64, b: f64) {
 fn assert_row(row: &Value, (t, q_master): &(f64, [f64; 20]), hand: &HandModel, mode: &str) {
     let mut fields: Vec<_> = row.as_object().unwrap().keys().map(String::as_str).collect();
     let mut expected = FIELDS.to_vec();
-    (fields.sort_unstable(), expected.sort_unstable());
+    fields.sort_unstable();
+    expected.sort_unstable();
     assert_eq!(fields, expected);
     assert_eq!((row["t"].as_f64().unwrap(), numbers(&row["q_master"])), (*t, q_master.to_vec()));
     let (q, q_joint) = (numbers(&row["q"]), numbers(&row["q_joint"]));
