@@ -11,7 +11,8 @@ use teleop_common::net::clock::random_epoch;
 use crate::calibrate;
 use crate::cli::{Cli, Command, LogArgs, WatchArgs};
 use crate::failure::{Failure, OrFail as _, open_session};
-use crate::feedback::{Feedback, subscribe};
+use crate::feedback::Feedback;
+use crate::listen::Listener;
 use crate::run::run;
 use crate::shutdown::Shutdown;
 use crate::terminal::{Terminal, say};
@@ -108,7 +109,7 @@ fn watch_robot(args: &WatchArgs, shutdown: &Shutdown) -> Result<(), Failure> {
     let keys = Keys::new(&args.robot.name).or_usage()?;
     let session = open_session(&args.robot.connect, &[])?;
     let feedback = Arc::new(Feedback::new(random_epoch()));
-    let _subscribers = subscribe(&session, &keys, &feedback).or_runtime()?;
+    let _listener = Listener::start(&session, &keys, &feedback).or_runtime()?;
     let options = WatchOptions {
         json: args.json,
         duration: args.duration.map(Duration::from_secs_f64),

@@ -4,12 +4,11 @@
 //! asks for a [`Snapshot`].
 
 use std::collections::VecDeque;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
-use teleop_common::key::Keys;
 use teleop_common::mode::Mode;
-use teleop_common::net::{Arrival, NetError, Session, Subscriber};
+use teleop_common::net::Arrival;
 use teleop_common::time::{ClockOffset, Histogram, MonoTime};
 use teleop_common::wire::{
     Checked, Echo, HealthMessage, JointStateMessage, MappingMessage, Message, REJECTIONS, Rejection, WireError,
@@ -206,6 +205,17 @@ impl Feedback {
         })
     }
 
+    /// Whether something that the robot publishes all the time, once it follows poses, has not come for a while.
+    #[must_use]
+    pub fn is_deaf(&self, now: MonoTime) -> bool {
+        let state = self.lock();
+        let missing = |at: Option<MonoTime>| at.is_none_or(|at| now.since(at) >= SILENCE);
+        let follows = state.joints.as_ref().is_some_and(|heard| heard.message.pose_seq > 0);
+        missing(state.joints.as_ref().map(|heard| heard.at))
+            || missing(state.health.as_ref().map(|heard| heard.at))
+            || follows && missing(state.mapping.as_ref().map(|heard| heard.at))
+    }
+
     /// All round trips so far.
     #[must_use]
     pub fn round_trips(&self) -> Histogram {
@@ -242,21 +252,6 @@ impl Feedback {
     fn lock(&self) -> MutexGuard<'_, State> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
-}
-
-/// Lets `feedback` hear the robot whose keys these are, as long as the subscribers live.
-///
-/// # Errors
-/// The session is closed.
-pub fn subscribe(session: &Session, keys: &Keys, feedback: &Arc<Feedback>) -> Result<[Subscriber; 3], NetError> {
-    let joints = Arc::clone(feedback);
-    let mapping = Arc::clone(feedback);
-    let health = Arc::clone(feedback);
-    Ok([
-        session.subscribe(&keys.joints(), move |arrival| joints.on_joints(arrival))?,
-        session.subscribe(&keys.mapping(), move |arrival| mapping.on_mapping(arrival))?,
-        session.subscribe(&keys.health(), move |arrival| health.on_health(arrival))?,
-    ])
 }
 
 fn newer<M: Message>(last: &M, new: &M) -> bool {

@@ -7,6 +7,7 @@
 //! | [`pipeline`] | the source thread: frames in, poses out |
 //! | [`stream`] | the publisher thread behind a latest-value slot |
 //! | [`feedback`] | the robot as last heard, round trip, clock offset |
+//! | [`listen`] | subscriptions to the robot, declared anew where nothing comes |
 //! | [`terminal`] | the status line |
 //! | [`record`] | the recording of what is streamed |
 //! | [`run`] | `operator run`: the wiring of the above |
@@ -21,6 +22,7 @@ pub mod cli;
 pub mod failure;
 pub mod feedback;
 pub mod hand;
+pub mod listen;
 pub mod pipeline;
 pub mod record;
 pub mod run;

@@ -15,8 +15,9 @@ use teleop_common::viz::{Level, Scene, Viz};
 use crate::calibrate;
 use crate::cli::RunArgs;
 use crate::failure::{Failure, OrFail as _, open_session};
-use crate::feedback::{Feedback, subscribe};
+use crate::feedback::Feedback;
 use crate::hand::PoseFinder;
+use crate::listen::Listener;
 use crate::pipeline::{Parts, Pipeline, Progress, picture_time};
 use crate::record::Recorder;
 use crate::shutdown::Shutdown;
@@ -173,7 +174,7 @@ pub fn run(args: &RunArgs, shutdown: &Shutdown, terminal: &Terminal) -> Result<S
 
     let epoch = random_epoch();
     let feedback = Arc::new(Feedback::new(epoch));
-    let subscribers = subscribe(&session, &keys, &feedback).or_runtime()?;
+    let listener = Listener::start(&session, &keys, &feedback).or_runtime()?;
     let publisher = session.publisher(&keys.pose(), Stream::Command).or_runtime()?;
     let token = session.live_token(&keys.live_operator(epoch)).or_runtime()?;
     let side = side.or_else(|| robot_side(&session, &keys)).unwrap_or(HandSide::Right);
@@ -221,7 +222,7 @@ pub fn run(args: &RunArgs, shutdown: &Shutdown, terminal: &Terminal) -> Result<S
     // In the order of the data: source, network and recording, picture.
     let (progress, result) = pipeline.join();
     let sent = stream.counters().sent.load(Ordering::Relaxed);
-    drop((stream, token, subscribers));
+    drop((stream, token, listener));
     let recorded = recorder.map(Recorder::finish);
     if !viz.shutdown(VIEWER_TIMEOUT) {
         tracing::warn!("the viewer did not take everything in time");

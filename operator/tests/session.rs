@@ -19,7 +19,8 @@ use teleop_common::testing::shared_data;
 use teleop_common::time::MonoTime;
 use teleop_common::wire::{Checked, Echo, JointStateMessage, PoseMessage, Stamper, pack_joints};
 use teleop_operator::cli::{Cli, RunArgs};
-use teleop_operator::feedback::{Feedback, subscribe};
+use teleop_operator::feedback::Feedback;
+use teleop_operator::listen::Listener;
 use teleop_operator::run::{Summary, run};
 use teleop_operator::shutdown::Shutdown;
 use teleop_operator::terminal::Terminal;
@@ -353,7 +354,7 @@ fn watching_needs_a_robot() {
     let watch_name = |name: &str, seconds: f64| {
         let session = Session::open(&SessionConfig::connecting([peer.endpoint.as_str()])).unwrap();
         let feedback = Arc::new(Feedback::new(random_epoch()));
-        let _subscribers = subscribe(&session, &Keys::new(name).unwrap(), &feedback).unwrap();
+        let _listener = Listener::start(&session, &Keys::new(name).unwrap(), &feedback).unwrap();
         let options = WatchOptions {
             json: true,
             duration: Some(Duration::from_secs_f64(seconds)),

@@ -3,7 +3,7 @@
 use std::io::IsTerminal as _;
 use std::process::ExitCode;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
@@ -18,7 +18,7 @@ use crate::cli::{Cli, Command, LogArgs, RunArgs, ViewerArgs};
 use crate::config::{Config, ConfigError};
 use crate::control::Controller;
 use crate::driver::SimHand;
-use crate::receive::Receiver;
+use crate::receive::{PoseSubscription, Receiver};
 use crate::runtime::{ControlThread, LoopRecord};
 use crate::telemetry::Telemetry;
 use crate::usage::{UsageError, is_usage};
@@ -87,10 +87,8 @@ fn run(args: &RunArgs) -> anyhow::Result<()> {
     let telemetry =
         Telemetry::new(&session, &keys, epoch, Arc::clone(&receiver), viz.logger(), &hand, config.mapping.clone())?;
     let control = Arc::new(control);
-    let telemetry = TelemetryThread::start(telemetry, link.records, Arc::clone(&control))?;
-    let poses = session.subscribe(&keys.pose(), move |arrival| {
-        receiver.lock().unwrap_or_else(PoisonError::into_inner).on_pose(arrival);
-    })?;
+    let poses = PoseSubscription::new(&session, &keys, receiver)?;
+    let telemetry = TelemetryThread::start(telemetry, link.records, poses, Arc::clone(&control))?;
     let description = describe(&args.name, &hand, &config).into_bytes();
     let server = session.serve(&keys.describe(), move || description.clone())?;
     let token = session.live_token(&keys.live_robot(epoch))?;
@@ -104,8 +102,7 @@ fn run(args: &RunArgs) -> anyhow::Result<()> {
         session.locators().join(", ")
     );
     let end = wait_for_the_end(args.duration, || control.is_running());
-    // First nobody is heard any more, then the hand stops, then what is known is told.
-    drop((poses, server, token));
+    drop((server, token));
     let stopped_early = !control.is_running();
     drop(telemetry);
     drop(control);
@@ -185,7 +182,7 @@ fn describe(name: &str, hand: &HandModel, config: &Config) -> String {
     .to_string()
 }
 
-/// Reads the control loop's records until dropped.
+/// Reads the control loop's records, and keeps the subscription to poses alive, until dropped.
 struct TelemetryThread {
     stop: Arc<AtomicBool>,
     thread: Option<JoinHandle<()>>,
@@ -195,6 +192,7 @@ impl TelemetryThread {
     fn start(
         mut telemetry: Telemetry,
         mut records: rtrb::Consumer<LoopRecord>,
+        mut poses: PoseSubscription,
         control: Arc<ControlThread>,
     ) -> std::io::Result<Self> {
         let stop = Arc::new(AtomicBool::new(false));
@@ -203,6 +201,9 @@ impl TelemetryThread {
             while !stopped.load(Ordering::Relaxed) {
                 while let Ok(record) = records.pop() {
                     telemetry.on_record(&record, control.dropped());
+                }
+                if let Err(error) = poses.refresh(clock::now()) {
+                    tracing::error!("poses cannot be received: {error}");
                 }
                 std::thread::sleep(TELEMETRY_PERIOD);
             }

@@ -1,6 +1,10 @@
 //! From the network to the control loop: decodes poses, judges them, and leaves the newest good one in the slot.
 
-use teleop_common::net::Arrival;
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
+
+use teleop_common::key::Keys;
+use teleop_common::net::{Arrival, NetError, Session, Subscriber, clock};
 use teleop_common::time::{ClockOffset, Histogram, MonoTime};
 use teleop_common::wire::{Checked, Echo, PoseMessage, REJECTIONS, Rejection};
 
@@ -18,6 +22,7 @@ pub struct Receiver {
     slot: triple_buffer::Input<Option<PoseSample>>,
     echo: Echo,
     counts: Counts,
+    heard: Option<MonoTime>,
 }
 
 /// What became of the poses so far.
@@ -43,7 +48,14 @@ impl Receiver {
             slot,
             echo: Echo::NONE,
             counts: Counts::default(),
+            heard: None,
         }
+    }
+
+    /// When something last came on the pose key.
+    #[must_use]
+    pub fn heard(&self) -> Option<MonoTime> {
+        self.heard
     }
 
     /// What became of the poses so far.
@@ -60,6 +72,7 @@ impl Receiver {
 
     /// Takes what arrived on the pose key.
     pub fn on_pose(&mut self, arrival: Arrival<'_>) {
+        self.heard = Some(arrival.at);
         let result = match arrival.decode::<PoseMessage>() {
             Ok(message) => self.judge(&message, arrival.at),
             Err(error) => Err(Rejection::from(&error)),
@@ -115,10 +128,60 @@ impl Receiver {
     }
 }
 
+/// How long nothing may come before the subscription is declared anew.
+const RENEW_EVERY: Duration = Duration::from_secs(1);
+
+/// The subscription that feeds a [`Receiver`].
+///
+/// On a link that does not resend (plain UDP) the message that says "I subscribe to this" can get lost, and then no pose
+/// ever comes. So while none comes, the subscription is declared anew.
+pub struct PoseSubscription {
+    session: Session,
+    key: String,
+    receiver: Arc<Mutex<Receiver>>,
+    subscriber: Option<Subscriber>,
+    declared: MonoTime,
+}
+
+impl PoseSubscription {
+    /// Subscribes.
+    ///
+    /// # Errors
+    /// The session is closed.
+    pub fn new(session: &Session, keys: &Keys, receiver: Arc<Mutex<Receiver>>) -> Result<Self, NetError> {
+        let mut this =
+            Self { session: session.clone(), key: keys.pose(), receiver, subscriber: None, declared: clock::now() };
+        this.declare()?;
+        Ok(this)
+    }
+
+    /// Declares the subscription anew if nothing has come for a while; to be called often.
+    ///
+    /// # Errors
+    /// The session is closed.
+    pub fn refresh(&mut self, now: MonoTime) -> Result<(), NetError> {
+        if now.since(self.declared) < RENEW_EVERY {
+            return Ok(());
+        }
+        self.declared = now;
+        let heard = self.receiver.lock().unwrap_or_else(PoisonError::into_inner).heard();
+        if heard.is_some_and(|at| now.since(at) < RENEW_EVERY) { Ok(()) } else { self.declare() }
+    }
+
+    fn declare(&mut self) -> Result<(), NetError> {
+        // The old one goes first, so that operators are told of a new one.
+        drop(self.subscriber.take());
+        let receiver = Arc::clone(&self.receiver);
+        let subscriber = self.session.subscribe(&self.key, move |arrival| {
+            receiver.lock().unwrap_or_else(PoisonError::into_inner).on_pose(arrival);
+        })?;
+        self.subscriber = Some(subscriber);
+        Ok(())
+    }
+}
+
 #[cfg(test)]
 mod tests {
-    use std::time::Duration;
-
     use teleop_common::master::{Gesture, MasterGeometry, MasterPose};
     use teleop_common::wire::{Header, MAX_MESSAGE, encode_into};
 

@@ -21,6 +21,7 @@ use crate::cli::{RetargetArgs, Switch};
 use crate::config::{Config, ConfigError};
 use crate::control::{ControlParams, Controller, PoseSample};
 use crate::driver::JointState;
+use crate::usage::UsageError;
 
 /// After this long without a frame the hand stands still, whatever it did before.
 const SETTLED: Duration = Duration::from_secs(3);
@@ -214,6 +215,6 @@ fn progress(input: &Path) -> ProgressBar {
 }
 
 fn open(path: &Path) -> anyhow::Result<BufReader<File>> {
-    let file = File::open(path).with_context(|| format!("cannot open {}", path.display()))?;
+    let file = File::open(path).map_err(|error| UsageError(format!("cannot open {}: {error}", path.display())))?;
     Ok(BufReader::with_capacity(1 << 16, file))
 }

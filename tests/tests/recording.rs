@@ -36,8 +36,8 @@ fn a_recorded_hand_drives_the_robot_over_a_bad_network() {
     let far = format!("udp/{}", relay.address());
     let mut operator = Process::operator(&far, recording.to_str().unwrap(), &["--record", recorded]);
     let engaged = probe.wait_for(Mode::Engaged);
-    // From the first frames on. Not before: zenoh repeats nothing over UDP, so a declaration that is lost while the
-    // session opens is never made up for.
+    // From the first frames on. Not before: zenoh repeats nothing over UDP, so what is lost while the session opens is
+    // not always made up for.
     relay.set(Impairment { delay: 20 * MS, jitter: 5 * MS, loss: 0.01, ..Impairment::default() });
     let status = operator.wait(Duration::from_secs(60));
     assert_eq!(status.code(), Some(0), "{}", operator.stderr());
