@@ -115,7 +115,7 @@ pub struct RunArgs {
 /// Options of `operator calibrate`.
 #[derive(Args, Clone, Debug)]
 pub struct CalibrateArgs {
-    /// Keypoints: FILE.csv, FILE.jsonl, or zenoh for live ones on allegro/v1/<name>/in/hand
+    /// Keypoints: FILE.csv, FILE.jsonl, or zenoh for live ones on allegro/v1/NAME/in/hand
     #[arg(long, value_name = "SOURCE")]
     pub source: String,
     /// Where to save the sizes

@@ -110,6 +110,7 @@ fn assert_row(row: &Value, (t, q_master): &(f64, [f64; 20]), hand: &HandModel, m
     let mut expected = FIELDS.to_vec();
     fields.sort_unstable();
     expected.sort_unstable();
+    expected.sort_unstable();
     assert_eq!(fields, expected);
     assert_eq!((row["t"].as_f64().unwrap(), numbers(&row["q_master"])), (*t, q_master.to_vec()));
     let (q, q_joint) = (numbers(&row["q"]), numbers(&row["q_joint"]));
