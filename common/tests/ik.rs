@@ -37,9 +37,9 @@ impl Case {
     fn solve(&self, target: &Vector3<f64>, reference: &Own, start: &Own) -> (Own, IkReport) {
         let solver = FingerIk::new(self.chain(), &self.hand.joints);
         let (q, report) = solver.solve(self.chain(), target, reference, start, POSTURE_WEIGHT_MIN);
-        for slot in 0..4 {
+        for (slot, angle) in q.iter().take(4).enumerate() {
             let (lower, upper) = self.limits(slot);
-            assert!(q[slot] >= lower && q[slot] <= upper, "joint {slot} outside its limits");
+            assert!((lower..=upper).contains(angle), "joint {slot} outside its limits");
         }
         assert!(report.iterations <= FingerIk::MAX_ITERATIONS);
         let residual = (self.chain().tip(&q, TipFrame::Pole) - target).norm();

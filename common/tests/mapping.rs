@@ -1,5 +1,7 @@
 //! The mapping against closed forms, the paper's figures and an independent numerical reference.
 
+#![allow(clippy::unwrap_used, reason = "helpers of tests")]
+
 use nalgebra::Vector3;
 use proptest::prelude::*;
 use teleop_common::hand::{Finger, HandModel, HandSide};
