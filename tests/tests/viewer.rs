@@ -133,7 +133,9 @@ fn both_hands_are_in_the_browser() {
     probe.wait_for_motion(0.2);
 
     // How long software rendering takes to show the first picture depends on the machine.
-    let picture = root.join("target/viewer.png");
+    // target/release/deps/viewer-* is this program.
+    let program = std::env::current_exe().unwrap();
+    let picture = program.ancestors().nth(3).unwrap().join("viewer.png");
     let size = format!("{}x{}", SIZE.0, SIZE.1);
     let mut lacking = Vec::new();
     for after in ["10", "20", "40"] {
