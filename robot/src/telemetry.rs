@@ -3,7 +3,7 @@
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
-use teleop_common::hand::{HandModel, JointVector};
+use teleop_common::hand::HandModel;
 use teleop_common::key::Keys;
 use teleop_common::mapping::MappingParams;
 use teleop_common::mode::Mode;
@@ -119,10 +119,10 @@ impl Telemetry {
             pose_epoch: sample.map_or(0, |sample| sample.epoch),
             pose_seq: sample.map_or(0, |sample| sample.sequence),
             pose_captured: sample.map_or(MonoTime(0), |sample| sample.captured_remote),
-            q: pack_joints(&shown(&tick.state.q)),
-            dq: pack_joints(&shown(&tick.state.dq)),
-            tau: pack_joints(&shown(&tick.state.tau)),
-            q_command: pack_joints(&shown(&tick.command.q)),
+            q: pack_joints(&tick.state.q),
+            dq: pack_joints(&tick.state.dq),
+            tau: pack_joints(&tick.state.tau),
+            q_command: pack_joints(&tick.command.q),
         };
         told_once(self.joints.0.send(&message));
         if let Some(mapping) = &tick.mapping {
@@ -211,15 +211,6 @@ impl Telemetry {
         }
         self.logger.log_text(wall(tick.now), level, &text);
     }
-}
-
-/// `values` with zero for what is no number: a state that is a fault must not keep the fault from being told.
-fn shown(values: &JointVector) -> JointVector {
-    let mut out = *values;
-    for value in out.iter_mut().filter(|value| !value.is_finite()) {
-        *value = 0.0;
-    }
-    out
 }
 
 /// A time of the monotonic clock as ns since the UNIX epoch.
