@@ -47,7 +47,7 @@ def main() -> None:
         recording = arguments.recording
         if mirrored:
             recording = folder / "mirrored.csv"
-            write(recording, times, human)
+            write(recording, arguments.recording.open().readline().strip(), times, human)
         urdf = folder / "hand.urdf"
         hand.write_peer_urdf(urdf)
         theirs = dexi_rs.asset_path(f"robots/hands/allegro_hand/allegro_hand_{hand.side}.urdf")
@@ -112,8 +112,7 @@ def read(path: Path, side: str) -> tuple[np.ndarray, np.ndarray, bool]:
     return times, human, mirrored
 
 
-def write(path: Path, times: np.ndarray, human: np.ndarray) -> None:
-    header = ",".join(["frame", "time_s", *(f"p{i}_{axis}" for i in range(21) for axis in "xyz")])
+def write(path: Path, header: str, times: np.ndarray, human: np.ndarray) -> None:
     rows = np.column_stack([np.arange(len(times)), times, human.reshape(-1, 63)])
     np.savetxt(path, rows, delimiter=",", header=header, comments="", fmt=["%d", "%.6f"] + ["%.7f"] * 63)
 
@@ -125,7 +124,10 @@ def compete(everyone: list, human: np.ndarray, rounds: int) -> dict[str, list[me
         start = turn * len(everyone) // rounds
         for method in everyone[start:] + everyone[:start]:
             print(f"round {turn + 1}/{rounds}: {method.name}", file=sys.stderr, flush=True)
-            results[method.name].append(method.run(human))
+            try:
+                results[method.name].append(method.run(human))
+            except methods.Failure as failure:
+                sys.exit(f"error: {method.name}: {failure}")
     return results
 
 

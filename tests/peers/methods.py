@@ -17,6 +17,10 @@ from hand import FINGERS, Hand
 UNFILTERED = 1.0  # the peers' low-pass filters hand on their input
 
 
+class Failure(Exception):
+    """A method that cannot be run."""
+
+
 @dataclass
 class Run:
     q: np.ndarray  # (frames, 16), rad, in the order of the description
@@ -72,10 +76,10 @@ class Ours:
         done = subprocess.run(self.command, capture_output=True, text=True)
         whole = time.perf_counter() - began
         if done.returncode != 0:
-            raise RuntimeError(f"{' '.join(map(str, self.command))}\n{done.stderr}")
+            raise Failure(f"{' '.join(map(str, self.command))}\n{done.stderr.strip()}")
         rows = [json.loads(line) for line in self.output.read_text().splitlines()]
         if len(rows) != len(human):
-            raise RuntimeError(f"{self.name}: {len(rows)} frames come back for {len(human)}")
+            raise Failure(f"{len(rows)} frames come back for {len(human)}")
         step = json.loads(self.stats.read_text())["step_us"]
         poles = np.array([[row["p"][finger] for finger in FINGERS] for row in rows])
         return Run(np.array([row["q"] for row in rows]), step["p50"], step["p99"], poles, 1e6 * whole / len(rows))
