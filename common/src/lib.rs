@@ -9,6 +9,7 @@
 //! | [`hand`] | the robot hand: URDF + description to a flat [`hand::HandModel`], forward kinematics, Jacobians |
 //! | [`master`] | the human hand: the paradigmatic 20-joint model, keypoint fit, calibration, gestures |
 //! | [`mapping`] | the combined joint-Cartesian mapping, Eq. 1-14 |
+//! | [`guard`] | keeps the fingertips out of each other |
 //! | [`ik`] | bounded lexicographic inverse kinematics of one finger |
 //! | [`mode`] | what the robot is doing |
 //! | [`key`] | key expressions of a robot |
@@ -17,6 +18,7 @@
 //! | [`time`] | monotonic time as a number, clock offset, latency histogram |
 //! | [`testing`] | where tests find recordings |
 
+pub mod guard;
 pub mod hand;
 pub mod ik;
 pub mod key;

@@ -177,6 +177,7 @@ fn describe(name: &str, hand: &HandModel, config: &Config) -> String {
             "smoothing_s": config.control.smoothing,
             "engage_speed_rad_s": config.control.engage_speed,
             "engage_ramp_s": config.control.engage_ramp,
+            "tip_overlap_m": config.control.tip_overlap,
         },
     })
     .to_string()

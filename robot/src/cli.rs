@@ -25,7 +25,7 @@ Configuration file (--config FILE), every value optional:
   [mapping]                   # mode, r1, r2 (m), scale, anchor, joint_map, gain, thumb_gain
   r2 = 0.06
   [control]                   # rate_hz, hold_after_s, max_age_s, smoothing_s, engage_speed_rad_s, engage_ramp_s,
-  hold_after_s = 0.2          # velocity_scale, acceleration_scale
+  hold_after_s = 0.2          # tip_overlap_m, velocity_scale, acceleration_scale
 
 Exit codes: 0 done (also after Ctrl-C), 1 failed while running, 2 wrong usage or configuration.";
 

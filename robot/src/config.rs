@@ -41,6 +41,7 @@ struct ControlFile {
     smoothing_s: f64,
     engage_speed_rad_s: f64,
     engage_ramp_s: f64,
+    tip_overlap_m: f64,
     velocity_scale: f64,
     acceleration_scale: f64,
 }
@@ -55,6 +56,7 @@ impl Default for ControlFile {
             smoothing_s: params.smoothing,
             engage_speed_rad_s: params.engage_speed,
             engage_ramp_s: params.engage_ramp,
+            tip_overlap_m: params.tip_overlap,
             velocity_scale: 1.0,
             acceleration_scale: 1.0,
         }
@@ -188,6 +190,7 @@ impl ControlFile {
                     "from 0.05 to 20 rad/s",
                 )?,
                 engage_ramp: range("engage_ramp_s", self.engage_ramp_s, 0.0, 30.0, "from 0 to 30 s")?,
+                tip_overlap: range("tip_overlap_m", self.tip_overlap_m, 0.0, 0.1, "from 0 to 0.1 m (no guard)")?,
             },
             gate: GateParams {
                 max_age: Duration::from_secs_f64(max_age),

@@ -1,6 +1,7 @@
 use std::time::Duration;
 
-use teleop_common::hand::{HandModel, JointVector};
+use teleop_common::guard::TipGuard;
+use teleop_common::hand::{HandModel, JointVector, MAX_FINGERS};
 use teleop_common::mapping::{MappingOutput, MappingParams, ParamError, Retargeter};
 use teleop_common::master::MasterPose;
 use teleop_common::mode::Mode;
@@ -22,6 +23,8 @@ pub struct ControlParams {
     pub engage_speed: f64,
     /// Time over which that limit widens to the joints' own, s.
     pub engage_ramp: f64,
+    /// How deep two fingertips may be commanded into each other, m. More squeezes harder what is between them.
+    pub tip_overlap: f64,
 }
 
 impl Default for ControlParams {
@@ -32,6 +35,7 @@ impl Default for ControlParams {
             smoothing: 0.008,
             engage_speed: 1.0,
             engage_ramp: 1.0,
+            tip_overlap: 0.0005,
         }
     }
 }
@@ -96,12 +100,15 @@ pub struct TickRecord {
 pub struct Controller {
     params: ControlParams,
     retargeter: Retargeter,
+    guard: TipGuard,
     conditioner: Option<Conditioner>,
     mode: Mode,
     fault: Fault,
     engaged_at: MonoTime,
     sample: Option<PoseSample>,
     mapping: Option<MappingOutput>,
+    // Its posture with the fingertips apart.
+    target: JointVector,
     // The last valid state of the hand.
     state: JointState,
     tick: u64,
@@ -118,6 +125,7 @@ impl Controller {
         let state = JointState { q: hand.home(), dq: still, tau: still };
         Ok(Self {
             params,
+            guard: TipGuard::new(&hand, params.tip_overlap),
             retargeter: Retargeter::new(hand, mapping)?,
             conditioner: None,
             mode: Mode::Idle,
@@ -125,6 +133,7 @@ impl Controller {
             engaged_at: MonoTime(0),
             sample: None,
             mapping: None,
+            target: state.q,
             state,
             tick: 0,
             holds: 0,
@@ -201,7 +210,12 @@ impl Controller {
         if let Some(sample) = fresh {
             let known = self.sample.as_ref().map(|last| (last.epoch, last.sequence));
             if known != Some((sample.epoch, sample.sequence)) {
-                self.mapping = Some(retargeter.map(&sample.pose));
+                let mapping = retargeter.map(&sample.pose);
+                // A finger that only copies the human's shape keeps it: the others go round it.
+                let mut movable = [false; MAX_FINGERS];
+                movable.iter_mut().zip(mapping.fingers()).for_each(|(own, signals)| *own = signals.k > 0.0);
+                self.target = self.guard.apart(retargeter.hand(), &mapping.q, &movable);
+                self.mapping = Some(mapping);
                 self.sample = Some(*sample);
             }
             if self.mode != Mode::Engaged {
@@ -212,13 +226,13 @@ impl Controller {
             self.mode = Mode::Holding;
             self.holds += 1;
         }
-        match (self.mode, &self.mapping) {
-            (Mode::Engaged, Some(mapping)) => {
+        match self.mode {
+            Mode::Engaged => {
                 let since = now.since(self.engaged_at).as_secs_f64();
                 // The limit widens tenfold over the ramp, then only the joints' own limits count.
                 let ramp = since < params.engage_ramp;
                 let widened = params.engage_speed * (1.0 + 9.0 * since / params.engage_ramp);
-                conditioner.follow(&mapping.q, if ramp { widened } else { f64::INFINITY });
+                conditioner.follow(&self.target, if ramp { widened } else { f64::INFINITY });
             }
             _ => conditioner.hold(),
         }
