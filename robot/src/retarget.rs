@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::Context as _;
 use indicatif::{ProgressBar, ProgressStyle};
-use teleop_common::hand::{HandModel, TipFrame};
+use teleop_common::hand::{HandModel, JointVector, TipFrame};
 use teleop_common::mapping::{FingerSignals, MappingOutput, Retargeter};
 use teleop_common::master::MasterPose;
 use teleop_common::time::MonoTime;
@@ -94,6 +94,8 @@ struct Live {
     controller: Controller,
     params: ControlParams,
     state: JointState,
+    // The command before the last.
+    before: JointVector,
     tick: u64,
     start: Option<f64>,
     sequence: u64,
@@ -101,18 +103,21 @@ struct Live {
 
 impl Live {
     fn new(hand: &HandModel, config: &Config) -> Result<Self, ConfigError> {
-        let still = teleop_common::hand::JointVector::zeros(hand.joints.len());
+        let still = JointVector::zeros(hand.joints.len());
         Ok(Self {
             controller: Controller::new(hand.clone(), config.mapping.clone(), config.control)?,
             params: config.control,
             state: JointState { q: hand.home(), dq: still, tau: still },
+            before: hand.home(),
             tick: 0,
             start: None,
             sequence: 0,
         })
     }
 
-    /// The ticks from `t` (s), when `pose` arrives, to before `next`; returns `mapping` with the last command in it.
+    /// The ticks from `t` (s), when `pose` arrives, to before `next`; returns `mapping` with the posture commanded
+    /// until then: the way from one command to the next takes a tick, and this is where on it the hand is at `next`,
+    /// so that rows differ by no more than the limits allow in the time between them.
     fn run(
         &mut self,
         t: f64,
@@ -141,22 +146,27 @@ impl Live {
             self.tick += 1;
             if now.since(sample.received) > self.params.hold_after + SETTLED {
                 // The rest of a long gap changes nothing.
-                self.tick = ((end.0 as f64) * 1e-9 * self.params.rate) as u64;
+                self.tick = self.tick.max((end.0 as f64 * 1e-9 * self.params.rate) as u64);
                 continue;
             }
             let record = self.controller.tick(now, Some(&sample), &self.state);
+            self.before = self.state.q;
             self.state.q = record.command.q;
             self.state.dq = record.command.dq;
         }
-        commanded(hand, mapping, &self.state)
+        let last = MonoTime((self.tick.saturating_sub(1) as f64 * 1e9 / self.params.rate) as u64);
+        let share = (end.since(last).as_secs_f64() * self.params.rate).min(1.0);
+        let mut q = self.before;
+        q.iter_mut().zip(self.state.q.iter()).for_each(|(value, next)| *value += (next - *value) * share);
+        commanded(hand, mapping, &q)
     }
 }
 
 /// The mapping's signals with the posture that was commanded in place of the one that was mapped.
-fn commanded(hand: &HandModel, mapping: &MappingOutput, state: &JointState) -> MappingOutput {
+fn commanded(hand: &HandModel, mapping: &MappingOutput, q: &JointVector) -> MappingOutput {
     let mut signals = Vec::with_capacity(mapping.fingers().len());
     for (chain, mapped) in hand.fingers.iter().zip(mapping.fingers()) {
-        let (own, joint) = (chain.select(&state.q), chain.select(&mapping.q_joint));
+        let (own, joint) = (chain.select(q), chain.select(&mapping.q_joint));
         let p = chain.tip(&own, TipFrame::Pole);
         signals.push(FingerSignals {
             p,
@@ -165,7 +175,7 @@ fn commanded(hand: &HandModel, mapping: &MappingOutput, state: &JointState) -> M
             ..*mapped
         });
     }
-    MappingOutput::new(mapping.q_joint, state.q, &signals)
+    MappingOutput::new(mapping.q_joint, *q, &signals)
 }
 
 /// Durations of the mapping steps.

@@ -322,16 +322,17 @@ fn keypoints() -> String {
 
 /// What the live robot commands for these frames: the controller, ticked in virtual time with the simulated hand.
 ///
-/// Frame i arrives at its time, the ticks are 1 / rate apart from the first frame on, and the result is the command at
-/// the last tick before the next frame.
-fn live(motion: &[(f64, [f64; 20])], side: HandSide) -> (Vec<JointVector>, Vec<u64>) {
+/// Frame i arrives at its time, the ticks are 1 / rate apart from the first frame on, and the result is where the hand
+/// is when the next frame comes, on its way from the command before the last tick to the one of the last tick.
+fn live(motion: &[(f64, [f64; 20])], side: HandSide) -> (Vec<JointVector>, Vec<Command>) {
     let hand = HandModel::allegro_v4(side);
     let params = ControlParams::default();
     let mut driver = SimHand::new(&hand, 1.0 / params.rate);
     driver.start().unwrap();
+    let mut commands = vec![Command { epoch: 0, tick: 0, q: hand.home() }];
     let mut controller = Controller::new(hand, MappingParams::default(), params).unwrap();
     let at = |t: f64| MonoTime(((t - motion[0].0) * 1e9) as u64);
-    let (mut commands, mut ticks, mut tick) = (Vec::new(), Vec::new(), 0_u64);
+    let (mut rows, mut tick) = (Vec::new(), 0_u64);
     let period = motion[motion.len() - 1].0 - motion[motion.len() - 2].0;
     for (index, (t, q)) in motion.iter().enumerate() {
         let received = at(*t);
@@ -344,7 +345,6 @@ fn live(motion: &[(f64, [f64; 20])], side: HandSide) -> (Vec<JointVector>, Vec<u
             received,
         };
         let end = at(motion.get(index + 1).map_or(t + period, |(next, _)| *next));
-        let mut command = None;
         loop {
             let now = MonoTime((tick as f64 * 1e9 / params.rate) as u64);
             if now >= end {
@@ -354,12 +354,14 @@ fn live(motion: &[(f64, [f64; 20])], side: HandSide) -> (Vec<JointVector>, Vec<u
             let state = driver.read(Duration::ZERO).unwrap();
             let record = controller.tick(now, Some(&sample), &state);
             driver.write(&record.command).unwrap();
-            command = Some(record.command.q);
+            commands.push(Command { epoch: 0, tick, q: record.command.q });
         }
-        commands.push(command.unwrap());
-        ticks.push(tick);
+        let [.., before, last] = &commands[..] else { panic!("no tick") };
+        let share = end.since(MonoTime(((tick - 1) as f64 * 1e9 / params.rate) as u64)).as_secs_f64() * params.rate;
+        let way = before.q.iter().zip(last.q.iter()).map(|(from, to)| from + (to - from) * share.min(1.0));
+        rows.push(JointVector::from_slice(&way.collect::<Vec<_>>()));
     }
-    (commands, ticks)
+    (rows, commands)
 }
 
 #[test]
@@ -375,14 +377,18 @@ fn conditioning_gives_what_the_live_robot_commands() {
             }
             let rows = Job::new(lines(&motion)).rows(&["--conditioning", "on", "--hand", side.name()]);
             assert_eq!(rows.len(), motion.len());
-            let (expected, ticks) = live(&motion, side);
-            let mut commands = vec![Command { epoch: 0, tick: 0, q: hand.home() }];
-            for ((row, expected), tick) in rows.iter().zip(&expected).zip(&ticks) {
+            let (expected, commands) = live(&motion, side);
+            let mut last: Option<(f64, JointVector)> = None;
+            for (row, expected) in rows.iter().zip(&expected) {
                 let q = JointVector::from_slice(&numbers(&row["q"]));
                 let t = &row["t"];
                 let apart = q.iter().zip(expected.iter()).fold(0.0, |most: f64, (a, b)| most.max((a - b).abs()));
                 assert!(apart < 1e-12, "{gesture} at {t} s: {apart:e} rad apart");
-                commands.push(Command { epoch: 0, tick: *tick, q });
+                let t = t.as_f64().unwrap();
+                if let Some((before, from)) = last.replace((t, q)) {
+                    let farthest = q.iter().zip(from.iter()).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
+                    assert!(farthest <= 7.0 * (t - before) + 1e-9, "{gesture} at {t} s: {farthest} rad");
+                }
             }
             let extremes = assert_limits(&commands, &hand, RATE, 1e-12);
             println!("{} {gesture}: {extremes:?}", side.name());
@@ -420,6 +426,16 @@ fn conditioning_leaves_slow_motion_as_it_is() {
 
 fn posture(row: &Value) -> Vec<f64> {
     numbers(&row["q"])
+}
+
+#[test]
+fn a_long_gap_is_passed_at_once() {
+    let mut motion = motion(Gesture::Wave, 1.0);
+    for (t, _) in &mut motion[50..] {
+        *t += 3600.1234;
+    }
+    let rows = Job::new(lines(&motion)).rows(&["--conditioning", "on"]);
+    assert_eq!(rows.len(), motion.len());
 }
 
 #[test]
