@@ -72,6 +72,7 @@ impl Retargeter {
         let q_joint = self.hand.clip(&self.joint_map.apply(&pose.q));
         let palm_from_anatomical = self.hand.anatomical_from_palm.transpose();
         let tips = Finger::ALL.map(|finger| pose.tip(finger));
+        self.tune(pose);
         let thumb_tip = tips[Finger::Thumb.index()];
 
         let mut signals = Finger::ALL.map(FingerSignals::zero);
@@ -98,12 +99,19 @@ impl Retargeter {
                 }
             } else {
                 let tip = &tips[chain.finger.index()];
-                out.p_cartesian = palm_from_anatomical * self.cartesian.finger(tip, &thumb_tip, &anchor);
+                out.p_cartesian = palm_from_anatomical * self.cartesian.finger(chain.finger, tip, &thumb_tip, &anchor);
             }
             let own = blend(chain, &self.solvers[slot], &posture, &mut self.last[slot], out);
             chain.scatter(&own, &mut q);
         }
         MappingOutput::new(q_joint, q, &signals[..self.hand.fingers.len()])
+    }
+
+    /// Takes over what the pose says about its operator.
+    fn tune(&mut self, pose: &MasterPose) {
+        let tuning = self.params.tuned(pose.tuning.as_ref());
+        self.cartesian.tune(&tuning);
+        (self.gain.r1, self.gain.r2) = (tuning.r1, tuning.r2);
     }
 
     /// Distances and gains of the fingers (Eq. 14); returns K_ST and the smallest distance.
