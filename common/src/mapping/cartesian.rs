@@ -1,6 +1,7 @@
 use nalgebra::Vector3;
 
-use super::{Contact, Tuning};
+use super::Tuning;
+use super::contact::{Contact, KNEE};
 use crate::hand::{Finger, HandModel, MAX_FINGERS};
 use crate::master::MasterGeometry;
 
@@ -39,7 +40,7 @@ impl CartesianMap {
         self.contact = tuning.contact.map(|touch| Contact { touch, release: tuning.r2 });
     }
 
-    /// p_C,T: target of the slave's thumb tip in O_SW for the master's in O_W (Eq. 10-12).
+    /// p_C,T: target of the slave's thumb tip in O_SW for the master's in O_W (Eq. 10-12), or for its [`Self::meeting`].
     ///
     /// The radial coordinate is scaled by c_s outside the span of the finger bases and interpolated between them
     /// inside, which makes it continuous and monotone; the others are scaled about the first finger's base. Below
@@ -54,6 +55,32 @@ impl CartesianMap {
         let mut target = first_slave + (tip - origin) * self.scale[Finger::Thumb.index()];
         target.x = self.radial(geometry, tip.x);
         target
+    }
+
+    /// Where the master's thumb tip would be if the keypoints of touching tips coincided, for its tips (O_W, m): moved
+    /// half of what [`Contact`] takes out towards the closest finger, and towards the mean where several are as close.
+    ///
+    /// Thumb and finger then go half of the way each; with all of it left to the finger, the place of contact would be
+    /// off by that half, and often out of reach.
+    #[must_use]
+    pub fn meeting(&self, tips: &[Vector3<f64>; MAX_FINGERS]) -> Vector3<f64> {
+        let thumb = tips[Finger::Thumb.index()];
+        if self.contact.iter().all(|contact| contact.touch <= 0.0) {
+            return thumb;
+        }
+        let fingers = self.bases[..self.count].iter().map(|(finger, _)| {
+            let contact = &self.contact[finger.index()];
+            let vector = tips[finger.index()] - thumb;
+            (vector.norm() - contact.touch, vector - contact.relative(&vector))
+        });
+        let closest = fingers.clone().map(|(beyond, _)| beyond).fold(f64::INFINITY, f64::min);
+        // A smooth choice of the closest: twice as far beyond its touch as the tracker's noise, a finger counts an eighth.
+        let (weight, sum) = fingers.fold((0.0, Vector3::zeros()), |(weight, sum), (beyond, removed)| {
+            let own = ((closest - beyond) / KNEE).exp();
+            (weight + own, sum + removed * own)
+        });
+        // Never empty, and the closest weighs 1.
+        if weight > 0.0 { thumb + sum * (0.5 / weight) } else { thumb }
     }
 
     /// x_S(x), Eq. 10.

@@ -1,12 +1,15 @@
 use nalgebra::Vector3;
 
+/// Width of the bend between touching and parting, m: some of a tracker's noise while fingers touch.
+pub(super) const KNEE: f64 = 0.008;
+
 /// Takes out of a finger's vector from the thumb what is not there when the fingers touch.
 ///
-/// A tracker's fingertip keypoints lie inside the fingers, so touching ones read some 15 to 28 mm apart. Shortened to
+/// A tracker's fingertip keypoints lie inside the fingers, so touching ones read some 15 to 30 mm apart. Shortened to
 /// f(delta) v / delta, the vector is zero there, and a human touch is a robot touch. f is zero up to `touch`, delta
-/// itself from `release` on, and in between the polynomial of fifth degree that has value, slope and curvature of
-/// either side: twice continuously differentiable, monotone, never above delta. Its slope is at most
-/// `1.512 + 15/8 touch / (release - touch)`: that much the tracker's noise grows where it is steepest.
+/// itself from `release` on. In between it bends within 8 mm into delta less the offset o = touch + 4 mm, as skin parts
+/// from skin, and gives the offset back in a smooth step. It is twice continuously differentiable, monotone, never above
+/// delta, and its slope is at most `1 + 15/8 o / (release - touch)`: that much a tracker's noise grows.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Contact {
     /// Distance of the keypoints at and below which the fingers touch, m; 0 leaves every vector as it is.
@@ -24,9 +27,11 @@ impl Contact {
         } else if delta <= self.touch {
             0.0
         } else {
-            let width = self.release - self.touch;
-            let u = (delta - self.touch) / width;
-            u * u * u * (self.touch * (10.0 - u * (15.0 - 6.0 * u)) + width * (6.0 - u * (8.0 - 3.0 * u)))
+            let (beyond, width) = (delta - self.touch, self.release - self.touch);
+            let knee = KNEE.min(width);
+            let (bend, step) = ((beyond / knee).min(1.0), beyond / width);
+            let parted = knee * bend.powi(3) * (1.0 - 0.5 * bend) + (beyond - knee).max(0.0);
+            parted + (self.touch + 0.5 * knee) * step.powi(3) * (10.0 - step * (15.0 - 6.0 * step))
         }
     }
 
@@ -55,11 +60,11 @@ mod tests {
             let step = 1e-6;
             prop_assert!((0.0..=delta * (1.0 + 1e-12)).contains(&f(delta)));
             let slope = (f(delta + step) - f(delta)) / step;
-            prop_assert!(slope >= -1e-9 && slope <= 1.512 + 1.875 * touch / width + 1e-6, "slope {slope}");
-            // Two steps of a micrometre see the same slope wherever they are, the ends of the band included:
-            // curvature is bounded, |S''| by 5.8 and |B''| by 4.1.
-            let curvature = (f(delta + 2.0 * step) - 2.0 * f(delta + step) + f(delta)) / step;
-            prop_assert!(curvature.abs() <= step * (5.8 * touch / width + 4.1) / width + 1e-9, "jump {curvature}");
+            let offset = touch + 0.5 * KNEE;
+            prop_assert!(slope >= -1e-9 && slope <= 1.0 + 1.875 * offset / width + 1e-6, "slope {slope}");
+            // Slopes a micrometre apart are the same wherever that is, the ends of the band included.
+            let bend = f(delta + 2.0 * step) - 2.0 * f(delta + step) + f(delta);
+            prop_assert!(bend.abs() / (step * step) <= 1.5 / KNEE + 5.8 * offset / (width * width) + 2.0, "bend {bend}");
         }
     }
 
@@ -69,10 +74,10 @@ mod tests {
         assert_eq!(contact.relative(&Vector3::new(0.012, 0.0, -0.016)), Vector3::zeros());
         let far = Vector3::new(0.03, -0.04, 0.07);
         assert_eq!(contact.relative(&far), far);
-        // Half way: f = (0.02 + 0.06 (6 - 4 + 0.75) / 4) / 2.
-        assert!((contact.distance(0.05) - (0.01 + 0.06 * 2.75 / 8.0)).abs() < 1e-15);
-        // It rises gently: 5 mm beyond the touch are half a millimetre.
-        assert!(contact.distance(0.025) < 0.5e-3);
+        // Half way, where half of the offset of 24 mm is given back.
+        assert!((contact.distance(0.05) - (0.026 + 0.012)).abs() < 1e-15);
+        // It rises gently: 3 mm beyond the touch are half a millimetre.
+        assert!(contact.distance(0.023) < 0.5e-3);
         let exact = Contact { touch: 0.0, release: 0.08 };
         let near = Vector3::new(1e-3, 2e-3, -3e-3);
         assert_eq!(exact.relative(&near), near);

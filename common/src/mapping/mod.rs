@@ -12,6 +12,7 @@
 //! | [`cartesian`](CartesianMap) | Eq. 9-12 |
 //! | [`contact`](Contact) | a human touch is a robot touch, whatever distance the tracker reads |
 //! | [`tuning`](Tuning) | what is known about one operator |
+//! | [`tuner`](tune()) | scales and radii for one operator and one robot hand |
 //! | [`retargeter`](Retargeter) | the whole step: a [`crate::master::MasterPose`] in, a [`MappingOutput`] out |
 
 mod cartesian;
@@ -19,6 +20,7 @@ mod contact;
 mod gain;
 mod params;
 mod retargeter;
+mod tuner;
 mod tuning;
 
 use nalgebra::Vector3;
@@ -28,6 +30,7 @@ pub use contact::Contact;
 pub use gain::Gain;
 pub use params::{Anchor, GainShape, MappingMode, MappingParams, ParamError, Pinned, ThumbGain, TuningUse};
 pub use retargeter::Retargeter;
+pub use tuner::{Judge, Tuned, contacts, tune};
 pub use tuning::{Tuning, TuningError};
 
 use crate::hand::{Finger, JointVector, MAX_FINGERS};

@@ -60,6 +60,11 @@ impl Retargeter {
         &self.params
     }
 
+    /// M_Q.
+    pub(super) fn joint_map(&self) -> &JointMap {
+        &self.joint_map
+    }
+
     /// Forgets the last solutions, for a motion that does not continue the one before.
     pub fn reset(&mut self) {
         self.last = [None; MAX_FINGERS];
@@ -73,6 +78,7 @@ impl Retargeter {
         let palm_from_anatomical = self.hand.anatomical_from_palm.transpose();
         let tips = Finger::ALL.map(|finger| pose.tip(finger));
         self.tune(pose);
+        let meeting = self.cartesian.meeting(&tips);
         let thumb_tip = tips[Finger::Thumb.index()];
 
         let mut signals = Finger::ALL.map(FingerSignals::zero);
@@ -87,7 +93,7 @@ impl Retargeter {
             out.p_joint = chain.tip(&posture, TipFrame::Pole);
             if chain.finger == Finger::Thumb {
                 (out.delta, out.k) = (closest, k_thumb);
-                anchor = self.cartesian.thumb(&pose.geometry, &thumb_tip);
+                anchor = self.cartesian.thumb(&pose.geometry, &meeting);
                 out.p_cartesian = palm_from_anatomical * anchor;
                 if self.params.anchor == Anchor::Projected {
                     let start = self.last_anchor.unwrap_or(posture);
