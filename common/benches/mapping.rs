@@ -17,8 +17,9 @@ use teleop_common::testing::shared_data;
 fn main() {
     let hand = HandModel::allegro_v4(HandSide::Right);
     let geometry = MasterGeometry::PARADIGMATIC;
-    let tour: Vec<_> =
-        (0..20_000).map(|n| MasterPose { q: Gesture::Tour.sample(f64::from(n) * 0.003), geometry }).collect();
+    let tour: Vec<_> = (0..20_000)
+        .map(|n| MasterPose { q: Gesture::Tour.sample(f64::from(n) * 0.003), geometry, tuning: None })
+        .collect();
 
     let mut retargeter = Retargeter::new(hand.clone(), MappingParams::default()).unwrap();
     let postures: Vec<JointVector> = tour.iter().map(|pose| retargeter.map(pose).q).collect();

@@ -6,7 +6,9 @@ use nalgebra::Vector3;
 use proptest::prelude::*;
 use teleop_common::hand::{Finger, HandModel, HandSide};
 use teleop_common::ik::IkStatus;
-use teleop_common::mapping::{Anchor, CartesianMap, MappingMode, MappingOutput, MappingParams, Retargeter};
+use teleop_common::mapping::{
+    Anchor, CartesianMap, MappingMode, MappingOutput, MappingParams, Pinned, Retargeter, Tuning, TuningUse,
+};
 use teleop_common::master::{Gesture, MasterGeometry, MasterPose};
 
 const MM: f64 = 1e-3;
@@ -16,7 +18,7 @@ fn hand() -> HandModel {
 }
 
 fn pose(q: [f64; 20]) -> MasterPose {
-    MasterPose { q, geometry: MasterGeometry::PARADIGMATIC }
+    MasterPose { q, geometry: MasterGeometry::PARADIGMATIC, tuning: None }
 }
 
 fn retargeter(params: MappingParams) -> Retargeter {
@@ -297,6 +299,102 @@ proptest! {
         for signals in output.fingers() {
             prop_assert!(signals.p.iter().chain(signals.p_cartesian.iter()).all(|value| value.is_finite()));
             prop_assert!((0.0..=1.0).contains(&signals.k));
+        }
+    }
+}
+
+/// An operator whose keypoints touch at 20 mm.
+const OPERATOR: Tuning =
+    Tuning { scale: [1.5, 1.7, 1.8, 1.6, 1.6], r1: 0.025, r2: 0.090, contact: [0.0, 0.020, 0.021, 0.022, 0.0] };
+
+#[test]
+fn what_a_pose_says_about_its_operator_holds_but_for_what_is_pinned_or_fixed() {
+    let params = MappingParams::default();
+    let own = params.tuned(None);
+    assert_eq!(own, Tuning { scale: [1.6; 5], r1: 0.020, r2: 0.080, contact: [0.0; 5] });
+    assert_eq!(params.tuned(Some(&OPERATOR)), OPERATOR);
+    assert_eq!(MappingParams::paper().tuned(Some(&OPERATOR)), MappingParams::paper().tuned(None));
+    let fixed = MappingParams { tuning: TuningUse::Fixed, ..params.clone() };
+    assert_eq!(fixed.tuned(Some(&OPERATOR)), own);
+
+    let pinned = |scale, r1, r2| MappingParams { pinned: Pinned { scale, r1, r2 }, ..params.clone() };
+    assert_eq!(pinned(true, false, false).tuned(Some(&OPERATOR)), Tuning { scale: own.scale, ..OPERATOR });
+    assert_eq!(pinned(false, false, true).tuned(Some(&OPERATOR)), Tuning { r2: own.r2, ..OPERATOR });
+    // Fingers do not touch beyond r1, where the mapping would not be Cartesian.
+    let small = pinned(false, true, false).tuned(Some(&OPERATOR));
+    assert_eq!(small, Tuning { r1: 0.020, contact: [0.0, 0.020, 0.020, 0.020, 0.0], ..OPERATOR });
+    for (r1, r2) in [(true, false), (false, true), (true, true)] {
+        for (own_r1, own_r2) in [(0.02, 0.021), (0.2, 0.21), (0.0001, 0.0012)] {
+            let params = MappingParams { r1: own_r1, r2: own_r2, ..pinned(false, r1, r2) };
+            let tuned = params.tuned(Some(&OPERATOR));
+            tuned.validate().unwrap();
+            assert!((!r1 || tuned.r1 == own_r1) && (!r2 || tuned.r2 == own_r2), "{tuned:?}");
+        }
+    }
+}
+
+#[test]
+fn a_tuning_that_says_what_the_robot_says_changes_no_bit() {
+    let mut plain = retargeter(MappingParams::default());
+    let mut tuned = retargeter(MappingParams::default());
+    let own = MappingParams::default().tuned(None);
+    for tick in 0..3000 {
+        let pose = pose(Gesture::Tour.sample(f64::from(tick) * 0.02));
+        assert_eq!(plain.map(&pose), tuned.map(&MasterPose { tuning: Some(own), ..pose }), "tick {tick}");
+    }
+}
+
+#[test]
+fn fingers_that_touch_by_the_trackers_account_touch() {
+    for (gesture, finger) in [
+        (Gesture::TapIndex, Finger::Index),
+        (Gesture::TapMiddle, Finger::Middle),
+        (Gesture::TapIndexClose, Finger::Index),
+        (Gesture::TapMiddleClose, Finger::Middle),
+    ] {
+        let mut retargeter = retargeter(MappingParams::default());
+        let mut touched = 0;
+        for tick in 0..=450 {
+            let pose = MasterPose { tuning: Some(OPERATOR), ..pose(gesture.sample(f64::from(tick) * 0.01)) };
+            let output = retargeter.map(&pose);
+            let signals = output.finger(finger).unwrap();
+            if signals.delta <= OPERATOR.contact[finger.index()] {
+                touched += 1;
+                let gap = pole_distance(&output, finger);
+                assert!(gap < 0.1 * MM, "{gesture} at tick {tick}: {gap} m");
+            }
+            for other in output.fingers() {
+                assert!(other.k > 0.0 || other.e_q == 0.0, "{gesture} disturbs the {:?}", other.finger);
+            }
+        }
+        assert!(touched > 100, "{touched}");
+    }
+}
+
+proptest! {
+    /// P7 with the contact distances: the targets move no faster than their parts, for any tuning.
+    #[test]
+    fn a_tuned_target_moves_no_faster_than_its_contact_allows(
+        q in prop::array::uniform20(0.0..1.5_f64), step in prop::array::uniform20(-1e-4..1e-4_f64),
+    ) {
+        let moved = std::array::from_fn(|joint| q[joint] + step[joint]);
+        let map = |q| {
+            let pose = MasterPose { tuning: Some(OPERATOR), ..pose(q) };
+            (pose, retargeter(MappingParams { anchor: Anchor::Reference, ..MappingParams::default() }).map(&pose))
+        };
+        let ((before_pose, before), (after_pose, after)) = (map(q), map(moved));
+        for (before, after) in before.fingers().iter().zip(after.fingers()) {
+            let motion = |finger: Finger| (after_pose.tip(finger) - before_pose.tip(finger)).norm();
+            let fastest = Finger::ALL.map(motion).into_iter().fold(0.0, f64::max);
+            let offset = 0.022 + 0.004;
+            let slope = 1.0 + 1.875 * offset / (0.090 - 0.022);
+            // Of the meeting point: the thumb's own, half a removed vector's, and the change of weights (at most 1/2 per
+            // 8 mm of difference between fingers, which part twice as fast as a tip moves, in vectors 2 offsets apart).
+            let meeting = 1.0 + 0.5 * (2.0 * slope + 2.0 * 2.0 / 0.008 * offset);
+            // The thumb's map has slope c_s or the ratio of the knuckles' spacings, per axis.
+            let relative = if after.finger == Finger::Thumb { 0.0 } else { 1.8 * slope * 2.0 };
+            let bound = (2.81 * meeting + relative) * fastest;
+            prop_assert!((after.p_cartesian - before.p_cartesian).norm() <= bound + 1e-12, "{:?}", after.finger);
         }
     }
 }

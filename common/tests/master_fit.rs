@@ -129,8 +129,10 @@ fn noise_does_not_flip_the_posture() {
             for joint in 0..20 {
                 angle_squares[joint] += (fit.q[joint] - truth[joint]).powi(2);
             }
-            let (fitted, true_pose) =
-                (MasterPose { q: fit.q, geometry: GEOMETRY }, MasterPose { q: truth, geometry: GEOMETRY });
+            let (fitted, true_pose) = (
+                MasterPose { q: fit.q, geometry: GEOMETRY, tuning: None },
+                MasterPose { q: truth, geometry: GEOMETRY, tuning: None },
+            );
             for finger in Finger::ALL {
                 tip_squares += (fitted.tip(finger) - true_pose.tip(finger)).norm_squared() / 5.0;
                 raw_squares += (in_palm(&seen, finger) - in_palm(&hand, finger)).norm_squared() / 5.0;
@@ -217,7 +219,7 @@ fn the_real_recording_fits() {
             "{name}: residual rms {:.1} mm, p95 {:.1}; {budget} of 2000 out of budget",
             residual.mean, residual.p95
         );
-        let pose = |i: usize| MasterPose { q: fits[i].q, geometry };
+        let pose = |i: usize| MasterPose { q: fits[i].q, geometry, tuning: None };
         for finger in Finger::ALL {
             let f = finger.index();
             let tip = summary(fits.iter().map(|fit| fit.fingers[f].tip_error * 1e3));

@@ -8,7 +8,7 @@ use teleop_common::master::{FINGER_TAPS, Gesture, JOINT_LIMITS, MasterGeometry, 
 const CONTACT: f64 = 1e-6;
 
 fn pose(q: [f64; 20]) -> MasterPose {
-    MasterPose { q, geometry: MasterGeometry::PARADIGMATIC }
+    MasterPose { q, geometry: MasterGeometry::PARADIGMATIC, tuning: None }
 }
 
 fn delta(q: [f64; 20], finger: Finger) -> f64 {

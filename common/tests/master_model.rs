@@ -91,7 +91,7 @@ proptest! {
 
     #[test]
     fn validation_never_panics(q in prop::collection::vec(any::<f64>(), 20), x in any::<f64>(), a in any::<f64>()) {
-        let mut pose = MasterPose { q: [0.0; 20], geometry: MasterGeometry::PARADIGMATIC };
+        let mut pose = MasterPose { q: [0.0; 20], geometry: MasterGeometry::PARADIGMATIC, tuning: None };
         pose.q.copy_from_slice(&q);
         pose.geometry.bases[1][0] = x;
         pose.geometry.phalanges[4][2] = a;
@@ -146,7 +146,7 @@ fn limits_hold_the_open_hand_and_are_ordered() {
 
 #[test]
 fn validation_names_what_is_wrong() {
-    let good = MasterPose { q: [0.0; 20], geometry: MasterGeometry::PARADIGMATIC };
+    let good = MasterPose { q: [0.0; 20], geometry: MasterGeometry::PARADIGMATIC, tuning: None };
     assert_eq!(good.validate(), Ok(()));
 
     let mut pose = good;

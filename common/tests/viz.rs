@@ -20,7 +20,7 @@ fn options() -> HubOptions {
 }
 
 fn pose() -> MasterPose {
-    MasterPose { q: OPEN, geometry: MasterGeometry::PARADIGMATIC }
+    MasterPose { q: OPEN, geometry: MasterGeometry::PARADIGMATIC, tuning: None }
 }
 
 fn operator_frame(time: i64) -> OperatorFrame {

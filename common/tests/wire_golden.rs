@@ -52,7 +52,7 @@ fn offsets_of_the_document() {
 
     let message = pose();
     encode_into(&message, &mut bytes).unwrap();
-    assert_eq!(&bytes[..8], b"ALGT\x01\x00\x01\x00");
+    assert_eq!(&bytes[..8], b"ALGT\x02\x00\x01\x00");
     assert_eq!(u64_at(&bytes, 8), message.header.epoch);
     assert_eq!(u64_at(&bytes, 16), message.header.seq);
     assert_eq!(u64_at(&bytes, 24), message.header.sent.0);
@@ -63,6 +63,11 @@ fn offsets_of_the_document() {
     assert_eq!(f32_at(&bytes, 64 + 4 * 19), message.q[19]);
     assert_eq!(f32_at(&bytes, 144 + 12 * 4), message.bases[4][0]);
     assert_eq!(f32_at(&bytes, 204 + 12 * 4 + 8), message.phalanges[4][2]);
+
+    assert_eq!(f32_at(&bytes, 264 + 4 * 4), message.tuning.scale[4]);
+    assert_eq!(f32_at(&bytes, 284), message.tuning.r1);
+    assert_eq!(f32_at(&bytes, 288), message.tuning.r2);
+    assert_eq!(f32_at(&bytes, 292 + 4 * 4), message.tuning.contact[4]);
 
     let message = joint_state();
     encode_into(&message, &mut bytes).unwrap();

@@ -9,11 +9,12 @@ use std::cell::Cell;
 
 use proptest::prelude::*;
 use samples::{health, joint_state, mapping, master_pose, pose};
+use teleop_common::mapping::Tuning;
 use teleop_common::master::MasterPose;
 use teleop_common::time::MonoTime;
 use teleop_common::wire::{
-    Checked, Header, HealthMessage, JointStateMessage, MAX_MESSAGE, MappingMessage, Message, PoseMessage, WireError,
-    decode, encode_into,
+    Checked, Header, HealthMessage, JointStateMessage, MAX_MESSAGE, MappingMessage, Message, PoseMessage,
+    TuningMessage, WireError, decode, encode_into,
 };
 
 thread_local! {
@@ -127,8 +128,8 @@ fn header_errors_say_what_is_wrong() {
     let mut bytes = encoded(&pose());
     bytes[4] = 9;
     let error = decode::<PoseMessage>(&bytes).unwrap_err();
-    assert_eq!(error, WireError::Protocol { ours: 1, theirs: 9 });
-    assert_eq!(error.to_string(), "peer speaks wire protocol 9, this side speaks 1: run the same release on both ends");
+    assert_eq!(error, WireError::Protocol { ours: 2, theirs: 9 });
+    assert_eq!(error.to_string(), "peer speaks wire protocol 9, this side speaks 2: run the same release on both ends");
     bytes[0] = b'X';
     assert_eq!(decode::<PoseMessage>(&bytes).unwrap_err(), WireError::Magic { found: *b"XLGT" });
 
@@ -176,7 +177,7 @@ fn every_float_must_be_finite() {
         }
     }
     let row = |start: usize, count: usize| (0..count).map(move |index| start + 4 * index);
-    one(&pose(), row(64, 50));
+    one(&pose(), row(64, 62));
     one(&joint_state(), row(98, 100));
     let signals = (0..5).flat_map(|finger| row(150 + 70 * finger + 1, 16).chain([150 + 70 * finger + 66]));
     one(&mapping(), [40, 44].into_iter().chain(row(50, 25)).chain(signals));
@@ -194,6 +195,11 @@ fn values_out_of_range() {
     bad_pose(144 + 12 * 2, 0.0241, "index"); // middle beyond index
     bad_pose(144 + 12 * 3, 0.008, "ring"); // ring where middle is
     bad_pose(144 + 12 * 4, 0.0, "little"); // little beyond ring
+    bad_pose(264 + 4, 10.1, "scale of the index");
+    bad_pose(284, 0.0, "r1");
+    bad_pose(288, 0.0205, "r2 of the thumb is 0.0205");
+    bad_pose(292 + 4 * 4, -0.001, "contact of the little");
+    bad_pose(292 + 4, 0.021, "contact of the index"); // beyond r1
     let state = joint_state();
     rejected(&state, 56, &[4], "mode");
     rejected(&state, 57, &[0], "joints");
@@ -234,11 +240,17 @@ fn pose_survives_in_single_precision() {
     let got: MasterPose = decode::<PoseMessage>(&encoded(&pose())).unwrap().pose();
     let numbers = |pose: &MasterPose| {
         let geometry = pose.geometry;
-        [&pose.q[..], geometry.bases.as_flattened(), geometry.phalanges.as_flattened()].concat()
+        let Tuning { scale, r1, r2, contact } = pose.tuning.unwrap();
+        let hand = [&pose.q[..], geometry.bases.as_flattened(), geometry.phalanges.as_flattened()].concat();
+        [&hand[..], &scale, &[r1, r2], &contact].concat()
     };
     for (sent, got) in numbers(&sent).iter().zip(numbers(&got)) {
         assert!((sent - got).abs() <= 6e-8 * sent.abs(), "{sent} {got}");
     }
+    // Without a tuning, twelve zeros.
+    let mut message = pose();
+    message.tuning = TuningMessage::default();
+    assert_eq!(decode::<PoseMessage>(&encoded(&message)).unwrap().pose().tuning, None);
 }
 
 #[test]
@@ -316,8 +328,8 @@ proptest! {
     #[test]
     fn garbage_values(kind in 1..=4_u8, bytes in prop::collection::vec(any::<u8>(), 500)) {
         let mut bytes = bytes;
-        bytes.truncate([264, 498, 500, 166][usize::from(kind) - 1]);
-        bytes[..8].copy_from_slice(b"ALGT\x01\x00\x00\x00");
+        bytes.truncate([312, 498, 500, 166][usize::from(kind) - 1]);
+        bytes[..8].copy_from_slice(b"ALGT\x02\x00\x00\x00");
         bytes[6] = kind;
         decode_all(&bytes);
     }

@@ -95,7 +95,10 @@ impl PoseFinder {
         self.last = Some(time);
         let keypoints = match hand {
             FrameData::Joints(q) => {
-                return Posed::Pose { pose: MasterPose { q: *q, geometry: self.geometry }, residual: None };
+                return Posed::Pose {
+                    pose: MasterPose { q: *q, geometry: self.geometry, tuning: None },
+                    residual: None,
+                };
             }
             FrameData::Keypoints(keypoints) => keypoints,
         };
@@ -132,7 +135,7 @@ impl PoseFinder {
                     fitter.reset();
                 }
                 let fit = fitter.fit(keypoints);
-                let pose = MasterPose { q: fit.q, geometry: *fitter.geometry() };
+                let pose = MasterPose { q: fit.q, geometry: *fitter.geometry(), tuning: None };
                 Posed::Pose { pose, residual: Some(fit.residual()) }
             }
         }
@@ -167,8 +170,11 @@ mod tests {
         let mut worst = 0.0_f64;
         for i in 0..200 {
             let time = from + Duration::from_millis(10) * i;
-            let truth =
-                MasterPose { q: Gesture::Fist.sample(time.as_secs_f64()), geometry: MasterGeometry::PARADIGMATIC };
+            let truth = MasterPose {
+                q: Gesture::Fist.sample(time.as_secs_f64()),
+                geometry: MasterGeometry::PARADIGMATIC,
+                tuning: None,
+            };
             let Posed::Pose { pose, residual } = finder.pose(time, &frame(time), false) else {
                 panic!("no pose at {time:?}")
             };
@@ -245,7 +251,7 @@ mod tests {
     #[test]
     fn joint_angles_need_no_measuring() {
         let q = Gesture::Tripod.sample(2.0);
-        let pose = MasterPose { q, geometry: MasterGeometry::PARADIGMATIC };
+        let pose = MasterPose { q, geometry: MasterGeometry::PARADIGMATIC, tuning: None };
         let posed = PoseFinder::new(pose.geometry).pose(Duration::ZERO, &FrameData::Joints(q), false);
         assert_eq!(posed, Posed::Pose { pose, residual: None });
     }

@@ -271,7 +271,8 @@ mod tests {
     #[test]
     fn mapping_and_health_are_by_name() {
         let mut retargeter = Retargeter::new(HandModel::allegro_v4(HandSide::Right), MappingParams::default()).unwrap();
-        let pose = MasterPose { q: Gesture::TapIndex.sample(2.0), geometry: MasterGeometry::PARADIGMATIC };
+        let pose =
+            MasterPose { q: Gesture::TapIndex.sample(2.0), geometry: MasterGeometry::PARADIGMATIC, tuning: None };
         let output = retargeter.map(&pose);
         let mapping = MappingMessage::new(Header::new::<MappingMessage>(9, 1, MonoTime(0)), 77, 0.02, 0.08, &output);
         let mut rejected = [0; REJECTIONS];

@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 use teleop_common::hand::{HandError, HandModel, HandSide, allegro_v4_texts};
-use teleop_common::mapping::{MappingMode, MappingParams, ParamError};
+use teleop_common::mapping::{MappingMode, MappingParams, ParamError, Pinned};
 
 use crate::control::{ControlParams, GateParams};
 
@@ -153,9 +153,12 @@ impl Config {
         let file: File = toml::from_str(text).map_err(|error| syntax(error.to_string()))?;
         let preset = MappingParams::preset(overrides.preset.as_ref().unwrap_or(&file.preset))?;
         let mut merged = toml::Table::try_from(&preset).map_err(|error| syntax(error.to_string()))?;
+        let given = |name| file.mapping.contains_key(name);
+        let pinned = Pinned { scale: given("scale"), r1: given("r1"), r2: given("r2") };
         merged.extend(file.mapping);
         let mut mapping: MappingParams =
             merged.try_into().map_err(|error| syntax(format!("in [mapping]: {}", error.message())))?;
+        mapping.pinned = pinned;
         if let Some(mode) = overrides.mode {
             mapping.mode = mode;
         }
@@ -256,7 +259,8 @@ mod tests {
     #[test]
     fn a_file_changes_single_parameters_of_its_preset() {
         let config = parse("preset = \"paper\"\n[mapping]\nr2 = 0.05\n[control]\nrate_hz = 500").unwrap();
-        assert_eq!(config.mapping, MappingParams { r2: 0.05, ..MappingParams::paper() });
+        let pinned = Pinned { r2: true, ..Pinned::default() };
+        assert_eq!(config.mapping, MappingParams { r2: 0.05, pinned, ..MappingParams::paper() });
         assert_eq!(config.control.rate, 500.0);
         assert_eq!(parse("").unwrap().mapping, MappingParams::default());
     }
@@ -277,6 +281,7 @@ mod tests {
             ("[mapping]\nr1 = -1", "mapping.r1 = -1 is not usable"),
             ("[mapping]\nr2 = 0.01", "mapping.r2 = 0.01 is not usable: it must be at least r1"),
             ("[mapping]\nradius = 1", "radius"),
+            ("[mapping]\ntuning = \"mine\"", "expected `operator` or `fixed`"),
             ("[control]\nrate_hz = 0", "control.rate_hz = 0 is not usable: it must be from 20 to 2000 Hz"),
             ("[control]\nhold_after_s = nan", "control.hold_after_s = NaN"),
             ("speed = 3", "speed"),

@@ -207,7 +207,7 @@ mod tests {
         } else {
             Echo::NONE
         };
-        let pose = MasterPose { q: Gesture::Open.sample(0.0), geometry: MasterGeometry::PARADIGMATIC };
+        let pose = MasterPose { q: Gesture::Open.sample(0.0), geometry: MasterGeometry::PARADIGMATIC, tuning: None };
         let header = Header::new::<PoseMessage>(epoch, seq, operator(at));
         let message = PoseMessage::new(header, echo, operator(at), &pose);
         deliver(receiver, &message, at + 10);
@@ -245,7 +245,7 @@ mod tests {
         assert_eq!(rejected(&receiver, Rejection::Operator), 1);
         assert_eq!(receiver.echo().epoch, 7, "the driving operator keeps its echo");
         // What was sent at 1020 .. 1080 ms comes out of some buffer 3 s later.
-        let pose = MasterPose { q: Gesture::Open.sample(0.0), geometry: MasterGeometry::PARADIGMATIC };
+        let pose = MasterPose { q: Gesture::Open.sample(0.0), geometry: MasterGeometry::PARADIGMATIC, tuning: None };
         for seq in 2..6 {
             let stamp = MonoTime(AHEAD + (1000 + seq * 20) * MS);
             let message = PoseMessage::new(Header::new::<PoseMessage>(7, seq, stamp), Echo::NONE, stamp, &pose);

@@ -127,7 +127,8 @@ impl Telemetry {
         told_once(self.joints.0.send(&message));
         if let Some(mapping) = &tick.mapping {
             let header = self.mapping.1.header::<MappingMessage>(clock::now());
-            let message = MappingMessage::new(header, tick.tick, self.params.r1, self.params.r2, mapping);
+            let tuning = self.params.tuned(sample.and_then(|sample| sample.pose.tuning.as_ref()));
+            let message = MappingMessage::new(header, tick.tick, tuning.r1, tuning.r2, mapping);
             told_once(self.mapping.0.send(&message));
         }
     }

@@ -107,7 +107,7 @@ impl Bench {
 }
 
 fn pose(gesture: Gesture, t: f64) -> MasterPose {
-    MasterPose { q: gesture.sample(t), geometry: MasterGeometry::PARADIGMATIC }
+    MasterPose { q: gesture.sample(t), geometry: MasterGeometry::PARADIGMATIC, tuning: None }
 }
 
 /// Speed between two commands (rad/s), of the fastest joint.
@@ -242,7 +242,7 @@ fn any_pose(dice: &mut Dice) -> MasterPose {
     let mut roll = |low: f64, high: f64| low + (high - low) * dice.roll();
     let wild = roll(0.0, 1.0) < 0.5;
     let reach = if wild { std::f64::consts::TAU } else { 2.0 };
-    let mut pose = MasterPose { q: [0.0; 20], geometry: MasterGeometry::PARADIGMATIC };
+    let mut pose = MasterPose { q: [0.0; 20], geometry: MasterGeometry::PARADIGMATIC, tuning: None };
     for angle in &mut pose.q {
         *angle = roll(-reach, reach);
     }

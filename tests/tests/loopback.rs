@@ -16,7 +16,7 @@ use teleop_common::wire::{
 };
 use teleop_tests::relay::{Impairment, UdpRelay};
 
-const POSE: MasterPose = MasterPose { q: [0.25; 20], geometry: MasterGeometry::PARADIGMATIC };
+const POSE: MasterPose = MasterPose { q: [0.25; 20], geometry: MasterGeometry::PARADIGMATIC, tuning: None };
 const PATIENCE: Duration = Duration::from_secs(20);
 const MS: Duration = Duration::from_millis(1);
 

@@ -245,7 +245,7 @@ fn garbage_disturbs_nothing() {
     // Before anybody drives: none of it may move the hand.
     let vandal = probe.session.publisher(&probe.keys.pose(), Stream::Slow).unwrap();
     eventually("the robot listens", || vandal.has_subscribers());
-    let pose = MasterPose { q: Gesture::Fist.sample(1.0), geometry: MasterGeometry::PARADIGMATIC };
+    let pose = MasterPose { q: Gesture::Fist.sample(1.0), geometry: MasterGeometry::PARADIGMATIC, tuning: None };
     let mut stamper = Stamper::new(13);
     let mut throw = || {
         let now = clock::now();

@@ -135,7 +135,7 @@ fn assert_row(row: &Value, (t, q_master): &(f64, [f64; 20]), hand: &HandModel, m
             "{field}"
         );
     }
-    let pose = MasterPose { q: *q_master, geometry: MasterGeometry::PARADIGMATIC };
+    let pose = MasterPose { q: *q_master, geometry: MasterGeometry::PARADIGMATIC, tuning: None };
     for chain in &hand.fingers {
         let finger = chain.finger;
         let (own, joint) = (chain.select(&q), chain.select(&q_joint));
@@ -182,7 +182,8 @@ fn every_row_keeps_the_contract() {
                 params.mode = serde_json::from_value(mode.into()).unwrap();
                 let mut retargeter = Retargeter::new(hand.clone(), params).unwrap();
                 for (row, (_, q)) in rows.iter().zip(&motion) {
-                    let mapped = retargeter.map(&MasterPose { q: *q, geometry: MasterGeometry::PARADIGMATIC });
+                    let mapped =
+                        retargeter.map(&MasterPose { q: *q, geometry: MasterGeometry::PARADIGMATIC, tuning: None });
                     let q = numbers(&row["q"]);
                     assert!(q.iter().zip(mapped.q.iter()).all(|(a, b)| (a - b).abs() < 1e-12), "{q:?}");
                 }
@@ -337,7 +338,7 @@ fn live(motion: &[(f64, [f64; 20])], side: HandSide) -> (Vec<JointVector>, Vec<C
     for (index, (t, q)) in motion.iter().enumerate() {
         let received = at(*t);
         let sample = PoseSample {
-            pose: MasterPose { q: *q, geometry: MasterGeometry::PARADIGMATIC },
+            pose: MasterPose { q: *q, geometry: MasterGeometry::PARADIGMATIC, tuning: None },
             epoch: 5,
             sequence: index as u64,
             captured_remote: received,

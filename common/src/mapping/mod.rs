@@ -10,19 +10,28 @@
 //! | [`params`](MappingParams) | every parameter, the two presets, validation |
 //! | [`gain`](Gain) | Eq. 14 |
 //! | [`cartesian`](CartesianMap) | Eq. 9-12 |
+//! | [`contact`](Contact) | a human touch is a robot touch, whatever distance the tracker reads |
+//! | [`tuning`](Tuning) | what is known about one operator |
+//! | [`tuner`](tune()) | scales and radii for one operator and one robot hand |
 //! | [`retargeter`](Retargeter) | the whole step: a [`crate::master::MasterPose`] in, a [`MappingOutput`] out |
 
 mod cartesian;
+mod contact;
 mod gain;
 mod params;
 mod retargeter;
+mod tuner;
+mod tuning;
 
 use nalgebra::Vector3;
 
 pub use cartesian::CartesianMap;
+pub use contact::Contact;
 pub use gain::Gain;
-pub use params::{Anchor, GainShape, MappingMode, MappingParams, ParamError, ThumbGain};
+pub use params::{Anchor, GainShape, MappingMode, MappingParams, ParamError, Pinned, ThumbGain, TuningUse};
 pub use retargeter::Retargeter;
+pub use tuner::{Judge, Tuned, contacts, tune};
+pub use tuning::{Tuning, TuningError};
 
 use crate::hand::{Finger, JointVector, MAX_FINGERS};
 use crate::ik::IkReport;

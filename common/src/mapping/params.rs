@@ -1,5 +1,8 @@
 use serde::{Deserialize, Serialize};
 
+use super::tuning::{MIN_BAND, Tuning};
+use crate::hand::MAX_FINGERS;
+
 /// Which mapping drives the hand.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
@@ -46,6 +49,28 @@ pub enum ThumbGain {
     Product,
 }
 
+/// Whose scale and radii hold.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum TuningUse {
+    /// The operator's, if the pose brings a [`Tuning`], but for what is [`Pinned`]; and the operator's contact distances.
+    #[default]
+    Operator,
+    /// The robot's own, for every operator.
+    Fixed,
+}
+
+/// Which parameters were set on purpose and hold for every operator.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Pinned {
+    /// c_s.
+    pub scale: bool,
+    /// r1.
+    pub r1: bool,
+    /// r2.
+    pub r2: bool,
+}
+
 /// Parameters of the mapping. Lengths in m (of the master), angles in rad.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -66,6 +91,11 @@ pub struct MappingParams {
     pub gain: GainShape,
     /// The thumb's gain.
     pub thumb_gain: ThumbGain,
+    /// Whose `scale`, `r1` and `r2` hold.
+    pub tuning: TuningUse,
+    /// Those of the three that hold in any case.
+    #[serde(skip)]
+    pub pinned: Pinned,
 }
 
 /// A parameter that cannot be used.
@@ -113,16 +143,25 @@ impl Default for MappingParams {
             joint_map: "split".to_owned(),
             gain: GainShape::Cosine,
             thumb_gain: ThumbGain::Closest,
+            tuning: TuningUse::Operator,
+            pinned: Pinned::default(),
         }
     }
 }
 
 impl MappingParams {
     /// The paper's own choices: c_s of the thumbs of Table 1 (162 mm to 60 mm), the unprojected anchor, r1 20 mm and
-    /// r2 40 mm (the paper gives no radii), M_Q by kinematic role.
+    /// r2 40 mm (the paper gives no radii), M_Q by kinematic role, for every operator.
     #[must_use]
     pub fn paper() -> Self {
-        Self { r2: 0.040, scale: 2.7, anchor: Anchor::Reference, joint_map: "role".to_owned(), ..Self::default() }
+        Self {
+            r2: 0.040,
+            scale: 2.7,
+            anchor: Anchor::Reference,
+            joint_map: "role".to_owned(),
+            tuning: TuningUse::Fixed,
+            ..Self::default()
+        }
     }
 
     /// The preset called `default` or `paper`.
@@ -135,6 +174,28 @@ impl MappingParams {
             "paper" => Ok(Self::paper()),
             other => Err(ParamError::Preset(other.to_owned())),
         }
+    }
+
+    /// What holds for a pose with this tuning of its operator; a tuning that passes [`Tuning::validate`] if both do.
+    #[must_use]
+    pub fn tuned(&self, operator: Option<&Tuning>) -> Tuning {
+        let own = Tuning { scale: [self.scale; MAX_FINGERS], r1: self.r1, r2: self.r2, contact: [0.0; MAX_FINGERS] };
+        let Some(operator) = operator.filter(|_| self.tuning == TuningUse::Operator) else {
+            return own;
+        };
+        let scale = if self.pinned.scale { own.scale } else { operator.scale };
+        let mut r1 = if self.pinned.r1 { own.r1 } else { operator.r1 };
+        let mut r2 = if self.pinned.r2 { own.r2 } else { operator.r2 };
+        // One radius of each need not fit together: the pinned one stays.
+        if r2 < r1 + MIN_BAND {
+            if self.pinned.r1 {
+                r2 = r1 + MIN_BAND;
+            } else {
+                r1 = r2 - MIN_BAND;
+            }
+        }
+        // Never beyond r1: where fingers are made to touch, the mapping is to be Cartesian.
+        Tuning { scale, r1, r2, contact: operator.contact.map(|touch| touch.min(r1)) }
     }
 
     /// Checks the ranges.

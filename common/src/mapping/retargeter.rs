@@ -60,6 +60,11 @@ impl Retargeter {
         &self.params
     }
 
+    /// M_Q.
+    pub(super) fn joint_map(&self) -> &JointMap {
+        &self.joint_map
+    }
+
     /// Forgets the last solutions, for a motion that does not continue the one before.
     pub fn reset(&mut self) {
         self.last = [None; MAX_FINGERS];
@@ -72,6 +77,8 @@ impl Retargeter {
         let q_joint = self.hand.clip(&self.joint_map.apply(&pose.q));
         let palm_from_anatomical = self.hand.anatomical_from_palm.transpose();
         let tips = Finger::ALL.map(|finger| pose.tip(finger));
+        self.tune(pose);
+        let meeting = self.cartesian.meeting(&tips);
         let thumb_tip = tips[Finger::Thumb.index()];
 
         let mut signals = Finger::ALL.map(FingerSignals::zero);
@@ -86,7 +93,7 @@ impl Retargeter {
             out.p_joint = chain.tip(&posture, TipFrame::Pole);
             if chain.finger == Finger::Thumb {
                 (out.delta, out.k) = (closest, k_thumb);
-                anchor = self.cartesian.thumb(&pose.geometry, &thumb_tip);
+                anchor = self.cartesian.thumb(&pose.geometry, &meeting);
                 out.p_cartesian = palm_from_anatomical * anchor;
                 if self.params.anchor == Anchor::Projected {
                     let start = self.last_anchor.unwrap_or(posture);
@@ -98,12 +105,19 @@ impl Retargeter {
                 }
             } else {
                 let tip = &tips[chain.finger.index()];
-                out.p_cartesian = palm_from_anatomical * self.cartesian.finger(tip, &thumb_tip, &anchor);
+                out.p_cartesian = palm_from_anatomical * self.cartesian.finger(chain.finger, tip, &thumb_tip, &anchor);
             }
             let own = blend(chain, &self.solvers[slot], &posture, &mut self.last[slot], out);
             chain.scatter(&own, &mut q);
         }
         MappingOutput::new(q_joint, q, &signals[..self.hand.fingers.len()])
+    }
+
+    /// Takes over what the pose says about its operator.
+    fn tune(&mut self, pose: &MasterPose) {
+        let tuning = self.params.tuned(pose.tuning.as_ref());
+        self.cartesian.tune(&tuning);
+        (self.gain.r1, self.gain.r2) = (tuning.r1, tuning.r2);
     }
 
     /// Distances and gains of the fingers (Eq. 14); returns K_ST and the smallest distance.

@@ -7,9 +7,10 @@ use serde::{Deserialize, Serialize};
 
 use super::fit::Fitter;
 use super::keypoints::{Keypoints, PalmFrame};
-use super::model::{MasterError, MasterGeometry};
+use super::model::{MasterError, MasterGeometry, MasterPose};
 use super::side::{Inspector, SideVerdict};
-use crate::hand::{Finger, HandSide, MAX_FINGERS};
+use crate::hand::{Finger, HandModel, HandSide, MAX_FINGERS};
+use crate::mapping::{MappingParams, ParamError, Tuning, TuningError, tune};
 
 /// Most frames kept; of longer streams every second, fourth, ... frame is kept.
 pub const MAX_FRAMES: usize = 600;
@@ -19,6 +20,15 @@ pub const MIN_FRAMES: usize = 30;
 const MIN_MOTION: f64 = 0.010;
 /// Spread (MAD over length) of a bone above which the tracker cannot be trusted.
 const MAX_SPREAD: f64 = 0.25;
+
+/// Distance of touching keypoints where none were seen touching, m.
+const TOUCH: f64 = 0.020;
+/// Farthest apart that touching keypoints can be, m.
+const MAX_TOUCH: f64 = 0.030;
+/// How far the distance scatters while fingers touch, m.
+const TOUCH_SCATTER: f64 = 0.006;
+/// Fewest frames of a finger's touches to go by.
+const MIN_TOUCH_FRAMES: u64 = 5;
 
 const FORMAT: &str = "allegro-teleop-calibration";
 const VERSION: u32 = 1;
@@ -33,8 +43,35 @@ pub struct Spread {
     pub phalanges: [[f64; 3]; MAX_FINGERS],
 }
 
-/// What is known about an operator's hand.
+/// When thumb and fingers touch: a tracker's keypoints lie inside the fingertips.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Touch {
+    /// Distance of the tips of thumb and finger up to which they touch, m; thumb (0), index, middle, ring, little.
+    pub distance: [f64; MAX_FINGERS],
+    /// In how many frames each was seen touching; with fewer than 5 its distance is that of all fingers together.
+    pub frames: [u64; MAX_FINGERS],
+}
+
+impl Default for Touch {
+    /// No touch seen: 20 mm.
+    fn default() -> Self {
+        Self { distance: [0.0, TOUCH, TOUCH, TOUCH, TOUCH], frames: [0; MAX_FINGERS] }
+    }
+}
+
+/// What the mapping onto one robot hand should know about the operator.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct HandTuning {
+    /// Name of the robot hand's model.
+    pub hand: String,
+    /// For this hand.
+    pub values: Tuning,
+}
+
+/// What is known about an operator's hand.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Calibration {
     /// Which hand.
@@ -49,6 +86,12 @@ pub struct Calibration {
     pub geometry: MasterGeometry,
     /// How far they vary, m.
     pub spread: Spread,
+    /// When its fingers touch.
+    #[serde(default)]
+    pub touch: Touch,
+    /// What follows for one robot hand, if it was worked out.
+    #[serde(skip)]
+    pub tuning: Option<HandTuning>,
 }
 
 /// Why the frames seen make no calibration.
@@ -118,6 +161,9 @@ pub enum CalibrationTextError {
     /// Numbers no hand has.
     #[error("calibration file: implausible hand")]
     Implausible(#[from] MasterError),
+    /// A tuning no operator can have.
+    #[error("calibration file: {0}")]
+    Tuning(#[from] TuningError),
     /// A statistic that is no number of metres.
     #[error("calibration file: {field} is {value}; expected a finite number of metres, not negative")]
     Statistic {
@@ -227,8 +273,17 @@ impl Calibrator {
 
     fn calibration(&self, side: HandSide, geometry: MasterGeometry, spread: Spread) -> Calibration {
         let mut fitter = Fitter::new(geometry, side);
-        let (residual, _) = median_and_deviation(self.kept.iter().map(|frame| fitter.fit(frame).residual()));
-        Calibration { side, frames: self.seen, rejected: self.rejected, residual, geometry, spread }
+        let mut distances = Vec::with_capacity(self.kept.len());
+        let (residual, _) = median_and_deviation(self.kept.iter().map(|frame| {
+            let fit = fitter.fit(frame);
+            let pose = MasterPose { q: fit.q, geometry, tuning: None };
+            // Of the fitted tips, because those are what the mapping sees.
+            distances.push(Finger::ALL.map(|finger| (pose.tip(finger) - pose.tip(Finger::Thumb)).norm()));
+            fit.residual()
+        }));
+        let touch = touches(&distances);
+        let (frames, rejected) = (self.seen, self.rejected);
+        Calibration { side, frames, rejected, residual, geometry, spread, touch, tuning: None }
     }
 
     /// Largest range of a fingertip coordinate in the palm frame between the 5th and 95th percentile, m.
@@ -277,6 +332,38 @@ impl Calibrator {
     }
 }
 
+/// When fingers touch, out of the distances of their tips from the thumb's (m, the thumb's own is not used) over time.
+///
+/// A finger touches near the bottom of each dip of its distance below 30 mm, if no other finger is clearly closer to the
+/// thumb then: in the frames within 6 mm of the dip's lowest. The 90 % quantile of all of these covers the tracker's
+/// scatter.
+fn touches(distances: &[[f64; MAX_FINGERS]]) -> Touch {
+    let mut touching: [Vec<f64>; MAX_FINGERS] = Default::default();
+    for (finger, found) in touching.iter_mut().enumerate().skip(1) {
+        let dips = distances.split(|frame| frame[finger] >= MAX_TOUCH);
+        for dip in dips {
+            let lowest = dip.iter().map(|frame| frame[finger]).fold(f64::INFINITY, f64::min);
+            found.extend(dip.iter().filter_map(|frame| {
+                let closest = frame[1..].iter().copied().fold(f64::INFINITY, f64::min);
+                let distance = frame[finger];
+                (distance <= lowest + TOUCH_SCATTER && distance <= closest + TOUCH_SCATTER).then_some(distance)
+            }));
+        }
+    }
+    let quantile = |values: &mut Vec<f64>| {
+        values.sort_by(f64::total_cmp);
+        values.get(values.len() * 9 / 10).copied()
+    };
+    let frames = [0, 1, 2, 3, 4].map(|finger: usize| touching[finger].len() as u64);
+    let all = quantile(&mut touching.concat()).unwrap_or(TOUCH);
+    let mut distance = [0.0; MAX_FINGERS];
+    for finger in 1..MAX_FINGERS {
+        let own = quantile(&mut touching[finger]).filter(|_| frames[finger] >= MIN_TOUCH_FRAMES);
+        distance[finger] = own.unwrap_or(all);
+    }
+    Touch { distance, frames }
+}
+
 /// Median and median absolute deviation; NaN of nothing.
 fn median_and_deviation(values: impl Iterator<Item = f64>) -> (f64, f64) {
     let mut values: Vec<f64> = values.collect();
@@ -298,13 +385,29 @@ struct File<'a> {
     format: &'static str,
     version: u32,
     calibration: &'a Calibration,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    tuning: Option<&'a HandTuning>,
 }
 
 impl Calibration {
+    /// Works out the tuning for `hand` (if it is not there already) and gives the reasons, for a person to read.
+    ///
+    /// # Errors
+    /// Parameters of the mapping that do not fit the hand.
+    pub fn tune(&mut self, hand: &HandModel, params: &MappingParams) -> Result<Vec<String>, ParamError> {
+        if self.tuning.as_ref().is_some_and(|tuning| tuning.hand == hand.name) {
+            return Ok(Vec::new());
+        }
+        let tuned = tune(hand, params, &self.geometry, &self.touch.distance)?;
+        self.tuning = Some(HandTuning { hand: hand.name.clone(), values: tuned.tuning });
+        Ok(tuned.report())
+    }
+
     /// As TOML text, to be saved.
     #[must_use]
     pub fn to_text(&self) -> String {
-        let file = File { format: FORMAT, version: VERSION, calibration: self };
+        let tuning = self.tuning.as_ref();
+        let file = File { format: FORMAT, version: VERSION, calibration: self, tuning };
         // Plain numbers in structs: TOML can hold them all.
         toml::to_string(&file).unwrap_or_default()
     }
@@ -325,11 +428,15 @@ impl Calibration {
             return Err(CalibrationTextError::Version { found });
         }
         let missing = || CalibrationTextError::Toml("missing table `calibration`".into());
-        let calibration: Self = table.remove("calibration").ok_or_else(missing)?.try_into().map_err(toml)?;
+        let mut calibration: Self = table.remove("calibration").ok_or_else(missing)?.try_into().map_err(toml)?;
+        calibration.tuning = table.remove("tuning").map(toml::Value::try_into).transpose().map_err(toml)?;
         if let Some(key) = table.keys().next() {
             return Err(CalibrationTextError::Toml(format!("unknown field `{key}`")));
         }
         calibration.geometry.validate()?;
+        if let Some(tuning) = &calibration.tuning {
+            tuning.values.validate()?;
+        }
         let statistic = |field, value: f64| {
             if value.is_finite() && value >= 0.0 {
                 Ok(())
@@ -341,6 +448,7 @@ impl Calibration {
         calibration.spread.bases.iter().try_for_each(|&value| statistic("spread.bases", value))?;
         let phalanges = calibration.spread.phalanges.iter().flatten();
         phalanges.copied().try_for_each(|value| statistic("spread.phalanges", value))?;
+        calibration.touch.distance.iter().try_for_each(|&value| statistic("touch.distance", value))?;
         Ok(calibration)
     }
 
@@ -361,6 +469,11 @@ impl Calibration {
             }
             lines.push(line);
         }
+        let touch = Finger::ALL[1..].iter().map(|finger| {
+            let (distance, frames) = (self.touch.distance[finger.index()], self.touch.frames[finger.index()]);
+            format!("{} {:.1} mm ({frames} frames)", finger.name(), distance * 1e3)
+        });
+        lines.push(format!("touches the thumb up to a distance of: {}", touch.collect::<Vec<_>>().join(", ")));
         lines
     }
 }

@@ -198,7 +198,7 @@ impl Fitter {
 
     /// [`Fitter::fit`] with the geometry, as the mapping takes it.
     pub fn pose(&mut self, keypoints: &Keypoints) -> MasterPose {
-        MasterPose { q: self.fit(keypoints).q, geometry: self.geometry }
+        MasterPose { q: self.fit(keypoints).q, geometry: self.geometry, tuning: None }
     }
 }
 

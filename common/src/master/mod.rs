@@ -13,7 +13,7 @@ mod model;
 mod side;
 
 pub use calibration::{
-    Calibration, CalibrationError, CalibrationTextError, Calibrator, MAX_FRAMES, MIN_FRAMES, Spread,
+    Calibration, CalibrationError, CalibrationTextError, Calibrator, HandTuning, MAX_FRAMES, MIN_FRAMES, Spread, Touch,
 };
 pub use fit::{FIT_LIMITS, FingerFit, Fit, FitSettings, FitStatus, Fitter};
 pub use gesture::{FINGER_TAPS, Gesture, OPEN, UnknownGesture, minimum_jerk};

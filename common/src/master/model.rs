@@ -3,6 +3,7 @@ use std::f64::consts::{FRAC_PI_2, PI, TAU};
 use nalgebra::{SMatrix, Vector3};
 
 use crate::hand::{Finger, MAX_FINGERS};
+use crate::mapping::{Tuning, TuningError};
 
 /// Largest magnitude of a joint angle that is taken as an angle at all, rad: a generous whole turn.
 pub const MAX_ANGLE: f64 = TAU;
@@ -90,6 +91,9 @@ pub enum MasterError {
         /// Where it is, m.
         position: [f64; 3],
     },
+    /// A tuning no operator can have.
+    #[error(transparent)]
+    Tuning(#[from] TuningError),
     /// Finger bases that are not in the order index, middle, ring, little from radial to ulnar.
     #[error(
         "base of the {} (x {x} m) must lie at least 1 mm radial of the {}'s (x {next_x} m); x points to the thumb side",
@@ -124,6 +128,8 @@ pub struct MasterPose {
     pub q: [f64; 20],
     /// The hand.
     pub geometry: MasterGeometry,
+    /// What the mapping should know about the operator; `None` leaves it to the robot.
+    pub tuning: Option<Tuning>,
 }
 
 impl MasterGeometry {
@@ -259,13 +265,14 @@ impl MasterPose {
         self.geometry.finger_points(finger, &self.finger(finger))[3]
     }
 
-    /// Checks angles and geometry, as data from a file or the network must be.
+    /// Checks angles, geometry and tuning, as data from a file or the network must be.
     ///
     /// # Errors
-    /// Names the first angle that is not finite or beyond [`MAX_ANGLE`], or what is wrong with the geometry.
+    /// Names the first angle that is not finite or beyond [`MAX_ANGLE`], or what is wrong with geometry or tuning.
     pub fn validate(&self) -> Result<(), MasterError> {
         validate_angles(&self.q)?;
-        self.geometry.validate()
+        self.geometry.validate()?;
+        Ok(self.tuning.map_or(Ok(()), |tuning| tuning.validate())?)
     }
 }
 

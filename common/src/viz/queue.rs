@@ -58,7 +58,7 @@ mod tests {
     fn frame(time: i64) -> Frame {
         Frame::Operator(OperatorFrame {
             time,
-            pose: MasterPose { q: [0.0; 20], geometry: MasterGeometry::PARADIGMATIC },
+            pose: MasterPose { q: [0.0; 20], geometry: MasterGeometry::PARADIGMATIC, tuning: None },
             r1: 0.02,
             r2: 0.08,
             residual: None,

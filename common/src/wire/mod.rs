@@ -13,4 +13,4 @@ pub use header::{Echo, Header, Kind, MAGIC, PROTOCOL, Stamper};
 pub use health::{HealthMessage, Quantiles, REJECTIONS, Rejection};
 pub use joints::{JointStateMessage, pack_joints};
 pub use mapping::{FingerMessage, MappingMessage};
-pub use pose::PoseMessage;
+pub use pose::{PoseMessage, TuningMessage};

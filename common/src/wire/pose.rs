@@ -2,10 +2,11 @@ use serde::{Deserialize, Serialize};
 
 use super::codec::sealed::Sealed;
 use super::{Checked, Echo, Header, Kind, Message, WireError};
+use crate::mapping::Tuning;
 use crate::master::{MasterGeometry, MasterPose};
 use crate::time::MonoTime;
 
-/// A pose of the master hand, with the hand's geometry: a robot needs no other message to follow it.
+/// A pose of the master hand, with the hand's geometry and tuning: a robot needs no other message to follow it.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct PoseMessage {
     /// Header.
@@ -20,6 +21,44 @@ pub struct PoseMessage {
     pub bases: [[f32; 3]; 5],
     /// Phalanx lengths, m, palm outwards.
     pub phalanges: [[f32; 3]; 5],
+    /// What the mapping should know about the operator, all zero if nothing is known.
+    pub tuning: TuningMessage,
+}
+
+/// [`Tuning`] on the wire.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct TuningMessage {
+    /// c_s of thumb, index, middle, ring, little.
+    pub scale: [f32; 5],
+    /// r1, m.
+    pub r1: f32,
+    /// r2, m.
+    pub r2: f32,
+    /// Distances at which the keypoints of thumb and finger touch, m.
+    pub contact: [f32; 5],
+}
+
+impl From<Tuning> for TuningMessage {
+    fn from(tuning: Tuning) -> Self {
+        let single = |values: [f64; 5]| values.map(|value| value as f32);
+        Self {
+            scale: single(tuning.scale),
+            r1: tuning.r1 as f32,
+            r2: tuning.r2 as f32,
+            contact: single(tuning.contact),
+        }
+    }
+}
+
+impl TuningMessage {
+    fn to_tuning(self) -> Option<Tuning> {
+        (self != Self::default()).then(|| Tuning {
+            scale: self.scale.map(f64::from),
+            r1: self.r1.into(),
+            r2: self.r2.into(),
+            contact: self.contact.map(f64::from),
+        })
+    }
 }
 
 impl PoseMessage {
@@ -34,6 +73,7 @@ impl PoseMessage {
             q: pose.q.map(|angle| angle as f32),
             bases: single(pose.geometry.bases),
             phalanges: single(pose.geometry.phalanges),
+            tuning: pose.tuning.map_or_else(TuningMessage::default, Into::into),
         }
     }
 
@@ -42,6 +82,7 @@ impl PoseMessage {
         MasterPose {
             q: self.q.map(f64::from),
             geometry: MasterGeometry { bases: double(self.bases), phalanges: double(self.phalanges) },
+            tuning: self.tuning.to_tuning(),
         }
     }
 }
@@ -58,7 +99,7 @@ impl Sealed for PoseMessage {}
 
 impl Message for PoseMessage {
     const KIND: Kind = Kind::Pose;
-    const LEN: usize = 264;
+    const LEN: usize = 312;
 
     fn header(&self) -> &Header {
         &self.header

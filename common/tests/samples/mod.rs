@@ -5,7 +5,7 @@
 use nalgebra::Vector3;
 use teleop_common::hand::{Finger, JointVector};
 use teleop_common::ik::{IkReport, IkStatus};
-use teleop_common::mapping::{FingerSignals, MappingOutput};
+use teleop_common::mapping::{FingerSignals, MappingOutput, Tuning};
 use teleop_common::master::{MasterGeometry, MasterPose};
 use teleop_common::time::MonoTime;
 use teleop_common::wire::{
@@ -20,7 +20,17 @@ pub fn echo() -> Echo {
 }
 
 pub fn master_pose() -> MasterPose {
-    MasterPose { q: std::array::from_fn(|joint| 0.05 * joint as f64 - 0.25), geometry: MasterGeometry::PARADIGMATIC }
+    let tuning = Tuning {
+        scale: [1.5, 1.625, 1.75, 1.875, 2.0],
+        r1: 0.020,
+        r2: 0.075,
+        contact: [0.0, 0.016, 0.017, 0.018, 0.019],
+    };
+    MasterPose {
+        q: std::array::from_fn(|joint| 0.05 * joint as f64 - 0.25),
+        geometry: MasterGeometry::PARADIGMATIC,
+        tuning: Some(tuning),
+    }
 }
 
 pub fn pose() -> PoseMessage {

@@ -57,7 +57,7 @@ impl Iterator for Frames {
             Err(error) => return Some(Err(UsageError(format!("{}: {error}", self.path.display())).into())),
         };
         let pose = match (&frame.data, &mut self.fitter) {
-            (FrameData::Joints(q), _) => MasterPose { q: *q, geometry: self.geometry },
+            (FrameData::Joints(q), _) => MasterPose { q: *q, geometry: self.geometry, tuning: None },
             (FrameData::Keypoints(keypoints), Some(fitter)) => fitter.pose(keypoints),
             (FrameData::Keypoints(_), None) => {
                 let (path, line) = (self.path.display(), self.reader.line());
