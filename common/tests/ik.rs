@@ -71,7 +71,7 @@ proptest! {
         for start in [None, Some(&reference), Some(&start)] {
             let (q, report) = case.solve(&target, &reference, start);
             prop_assert_eq!(report.status, IkStatus::Reached);
-            prop_assert!(distance(&q, &reference) < 1e-5, "{report:?}");
+            prop_assert!(distance(&q, &reference) < 1e-3, "{report:?}");
         }
     }
 

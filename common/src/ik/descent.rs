@@ -9,8 +9,10 @@ use crate::hand::{FingerChain, TipFrame};
 
 // Largest step of a joint in one iteration, rad: the tip is then at most 5 mm beside its linear prediction.
 const RADIUS: f64 = 0.35;
-// A Newton step below this (rad) is the last: what it leaves is its square.
-const LAST_STEP: f64 = 3e-5;
+// A Newton step below sqrt(LAST_STEP mu), rad, is the last: the 0.1 m/rad^2 that the finger is curved make of it a miss
+// that weighs like 1e-4 rad of posture. At most MAX_LAST_STEP, for the posture's own sake.
+const LAST_STEP: f64 = 1e-3;
+const MAX_LAST_STEP: f64 = 1e-4;
 // A rise of the weighted sum by this much (m^2) turns a step down: 3 mm off from a point that was exact.
 const RISE: f64 = 5e-6;
 // After that many iterations less and less of a rise is allowed: two linear predictions may send each other in a circle.
@@ -85,6 +87,7 @@ impl Problem<'_> {
         let mut state = self.state(&q);
         let mut best =
             Optimum { q, residual: state.residual.norm(), cost: state.cost, iterations: 0, converged: false };
+        let last_step = (LAST_STEP * self.weight.sqrt()).sqrt().min(MAX_LAST_STEP);
         let (mut radius, mut rise) = (RADIUS, RISE);
         let mut rho: Option<Vector3<f64>> = None;
         let mut active = [false; N];
@@ -123,7 +126,7 @@ impl Problem<'_> {
             };
             let trial = self.clip(&std::array::from_fn(|slot| q[slot] + step[slot]));
             let moved = step.iter().fold(0.0_f64, |largest, step| largest.max(step.abs()));
-            if moved < if is_newton { LAST_STEP } else { 1e-9 } {
+            if moved < if is_newton { last_step.min(0.5 * radius) } else { 1e-9 } {
                 let residual = self.residual(&trial);
                 let cost = self.cost(&residual, &trial);
                 // Below rounding either is as good.

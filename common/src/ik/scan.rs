@@ -135,7 +135,7 @@ struct Nodes<'a> {
 
 impl Nodes<'_> {
     /// Adds the roots of `a + b cos + c sin` in the range.
-    fn add(&mut self, a: f64, b: f64, c: f64) {
+    fn add_roots(&mut self, a: f64, b: f64, c: f64) {
         let size = (b * b + c * c).sqrt();
         if a.abs() > size {
             return;
@@ -146,15 +146,21 @@ impl Nodes<'_> {
         for turn in [Plane::new(cos, sin), Plane::new(cos, -sin)] {
             let turn = towards * turn;
             let (angle, inside) = self.sweep.clip(atan2_of(turn));
-            if inside && self.count < self.list.len() {
-                let mut slot = self.count;
-                while slot > 0 && self.list[slot - 1].0 > angle {
-                    self.list[slot] = self.list[slot - 1];
-                    slot -= 1;
-                }
-                self.list[slot] = (angle, turn);
-                self.count += 1;
+            if inside {
+                self.add(angle, turn);
             }
+        }
+    }
+
+    fn add(&mut self, angle: f64, turn: Plane) {
+        if self.count < self.list.len() {
+            let mut slot = self.count;
+            while slot > 0 && self.list[slot - 1].0 > angle {
+                self.list[slot] = self.list[slot - 1];
+                slot -= 1;
+            }
+            self.list[slot] = (angle, turn);
+            self.count += 1;
         }
     }
 }
@@ -377,6 +383,8 @@ impl Scan {
         let way = Way::new(self, target);
         let mut nodes = Nodes { sweep: &self.sweep, list: [(0.0, Plane::new(0.0, 0.0)); NODES + EVENTS], count: NODES };
         nodes.list[..NODES].copy_from_slice(&self.nodes);
+        let (angle, _) = self.sweep.clip(wish[1]);
+        nodes.add(angle, Plane::from_polar(1.0, angle));
         self.events(&way, &mut nodes);
         let mut pass = Pass { scan: self, rolls: self.rolls(&way.fixed), way, wish, weight, cap, near: false };
         let mut found = pass.valleys(&nodes);
@@ -402,11 +410,11 @@ impl Scan {
             let square = from.norm_squared() + way.turned.norm_squared();
             for stiff in &self.stiff {
                 let constant = square - stiff.length * stiff.length;
-                nodes.add(constant, 2.0 * from.dot(&way.turned), 2.0 * from.dot(&way.crossed));
+                nodes.add_roots(constant, 2.0 * from.dot(&way.turned), 2.0 * from.dot(&way.crossed));
             }
             for (sin, cos) in self.roll_ends {
                 let beside = |at: &Vector3<f64>| at.z * cos - at.y * sin;
-                nodes.add(beside(&way.fixed), beside(&way.turned), beside(&way.crossed));
+                nodes.add_roots(beside(&way.fixed), beside(&way.turned), beside(&way.crossed));
             }
         } else {
             for (_, radius, _) in self.rolls(&way.fixed) {
@@ -414,7 +422,7 @@ impl Scan {
                 let along = -2.0 * from.conj() * self.shoulder[1];
                 let square = from.norm_sqr() + self.shoulder[1].norm_sqr();
                 for stiff in &self.stiff {
-                    nodes.add(square - stiff.length * stiff.length, along.re, -along.im);
+                    nodes.add_roots(square - stiff.length * stiff.length, along.re, -along.im);
                 }
             }
         }
