@@ -1,9 +1,9 @@
-//! The inverse kinematics against brute force, at limits and at the singular open hand.
+//! The inverse kinematics of the Allegro's fingers and of any other: properties, motion, many starts.
 
-use nalgebra::Vector3;
+use nalgebra::{Rotation3, Vector3};
 use proptest::prelude::*;
 use proptest::strategy::ValueTree as _;
-use teleop_common::hand::{FingerChain, HandModel, HandSide, MAX_FINGER_JOINTS, TipFrame};
+use teleop_common::hand::{ChainJoint, Finger, FingerChain, HandModel, HandSide, MAX_FINGER_JOINTS, TipFrame};
 use teleop_common::ik::{FingerIk, IkReport, IkStatus, POSTURE_WEIGHT_MAX, POSTURE_WEIGHT_MIN};
 
 type Own = [f64; MAX_FINGER_JOINTS];
@@ -34,7 +34,7 @@ impl Case {
         q
     }
 
-    fn solve(&self, target: &Vector3<f64>, reference: &Own, start: &Own) -> (Own, IkReport) {
+    fn solve(&self, target: &Vector3<f64>, reference: &Own, start: Option<&Own>) -> (Own, IkReport) {
         let solver = FingerIk::new(self.chain(), &self.hand.joints);
         let (q, report) = solver.solve(self.chain(), target, reference, start, POSTURE_WEIGHT_MIN);
         for (slot, angle) in q.iter().take(4).enumerate() {
@@ -68,12 +68,11 @@ proptest! {
     ) {
         let (reference, start) = (case.posture(&reference), case.posture(&start));
         let target = case.chain().tip(&reference, TipFrame::Pole);
-        let (q, report) = case.solve(&target, &reference, &reference);
-        prop_assert_eq!(report.status, IkStatus::Reached);
-        prop_assert!(distance(&q, &reference) < 1e-6);
-        // From elsewhere at least the tip must get there, or as near as a start from there allows.
-        let (_, report) = case.solve(&target, &reference, &start);
-        prop_assert!(report.residual < 1e-4, "{report:?}");
+        for start in [None, Some(&reference), Some(&start)] {
+            let (q, report) = case.solve(&target, &reference, start);
+            prop_assert_eq!(report.status, IkStatus::Reached);
+            prop_assert!(distance(&q, &reference) < 1e-3, "{report:?}");
+        }
     }
 
     #[test]
@@ -82,61 +81,71 @@ proptest! {
     ) {
         let reference = case.posture(&from);
         let target = case.chain().tip(&reference, TipFrame::Pole);
-        let (before, _) = case.solve(&target, &reference, &reference);
+        let (before, _) = case.solve(&target, &reference, None);
         let moved = target + Vector3::from(step);
-        let (after, report) = case.solve(&moved, &reference, &before);
+        let (after, report) = case.solve(&moved, &reference, Some(&before));
         let way = (case.chain().tip(&after, TipFrame::Pole) - case.chain().tip(&before, TipFrame::Pole)).norm();
         prop_assert!(way <= 2.0 * Vector3::from(step).norm() + 1e-6, "{report:?}");
     }
 }
 
-/// The witness that made the target reaches it too, so the solution should not be farther from the reference.
-#[test]
-fn a_target_near_the_reference_is_reached_and_costs_no_more_than_it_must() {
-    let mut runner = proptest::test_runner::TestRunner::deterministic();
-    let unit = prop::array::uniform4(0.0..=1.0_f64);
-    let (mut missed, mut dearer, total) = (0, 0, 4000);
-    for _ in 0..total {
-        let case = case().new_tree(&mut runner).unwrap().current();
-        let reference = case.posture(&unit.new_tree(&mut runner).unwrap().current());
-        let mut witness = reference;
-        for (slot, way) in unit.new_tree(&mut runner).unwrap().current().into_iter().enumerate() {
-            let (lower, upper) = case.limits(slot);
-            witness[slot] = (witness[slot] + 0.3 * (way - 0.5)).clamp(lower, upper);
-        }
-        let target = case.chain().tip(&witness, TipFrame::Pole);
-        let (q, report) = case.solve(&target, &reference, &reference);
-        missed += usize::from(report.residual > 1e-5);
-        dearer += usize::from(distance(&q, &reference) > distance(&witness, &reference) + 1e-3);
+/// A finger of `count` joints with axes, offsets and limits of its own.
+fn random_finger(unit: &mut impl FnMut() -> f64, count: usize) -> (FingerChain, HandModel) {
+    let mut hand = HandModel::allegro_v4(HandSide::Right);
+    let mut vector = |size: f64| Vector3::new(unit() - 0.5, unit() - 0.5, unit() - 0.5) * size;
+    let joints = (0..count)
+        .map(|joint| {
+            let rotation = Rotation3::from_scaled_axis(vector(3.0)).into_inner();
+            ChainJoint::new(joint, vector(0.08), rotation, vector(1.0) + Vector3::new(0.0, 0.0, 1e-3))
+        })
+        .collect();
+    let pole = vector(0.1);
+    for joint in &mut hand.joints {
+        joint.lower = -0.2 - unit();
+        joint.upper = 0.2 + 1.5 * unit();
     }
-    println!("of {total} targets {missed} were missed, {dearer} reached in a posture farther off than needed");
-    assert!(missed * 1000 <= total, "{missed} of {total} targets missed");
-    assert!(dearer * 200 < total, "{dearer} of {total} ended in a posture farther off than needed");
+    let base = Vector3::zeros();
+    (FingerChain { finger: Finger::Index, joints, pole, center: pole, base, length: 0.1 }, hand)
 }
 
-/// Targets anywhere around the hand: no dense sample of the joint box comes nearer by more than its own spacing allows.
+/// Fingers of 1 to 5 joints: forty random starts find nothing better but in rare cases, within reach and out of it.
 #[test]
-fn unreachable_targets_get_the_nearest_point() {
-    for finger in 0..4 {
-        let case = Case { hand: HandModel::allegro_v4(HandSide::Right), finger };
-        let mut tips = Vec::new();
-        let grid = 14;
-        for index in 0..grid * grid * grid * grid {
-            let unit = |divisor: usize| (index / divisor % grid) as f64 / (grid - 1) as f64;
-            let q = case.posture(&[unit(1), unit(grid), unit(grid * grid), unit(grid * grid * grid)]);
-            tips.push(case.chain().tip(&q, TipFrame::Pole));
+fn any_finger_is_solved_as_well_as_from_many_starts() {
+    let mut runner = proptest::test_runner::TestRunner::deterministic();
+    let mut unit = || (0.0..1.0_f64).new_tree(&mut runner).unwrap().current();
+    let (mut worse, mut lost, total) = (0, 0, 600);
+    for case in 0..total {
+        let count = 1 + case % MAX_FINGER_JOINTS;
+        let (chain, hand) = random_finger(&mut unit, count);
+        let mut posture = || {
+            let mut q = [0.0; MAX_FINGER_JOINTS];
+            for (angle, joint) in q.iter_mut().take(count).zip(&hand.joints) {
+                *angle = joint.lower + (joint.upper - joint.lower) * unit();
+            }
+            q
+        };
+        let solver = FingerIk::new(&chain, &hand.joints);
+        let (witness, reference) = (posture(), posture());
+        let out = if case % 2 == 0 { 1.0 } else { 1.4 };
+        let target = chain.tip(&witness[..count], TipFrame::Pole) * out;
+        let mu = [POSTURE_WEIGHT_MIN, 1e-4, POSTURE_WEIGHT_MAX][case % 3];
+        let length = |q: &Own| {
+            let miss = (chain.tip(&q[..count], TipFrame::Pole) - target).norm_squared();
+            (miss + (mu * distance(q, &reference)).powi(2)).sqrt()
+        };
+        let (q, report) = solver.solve(&chain, &target, &reference, None, mu);
+        assert!(report.iterations <= FingerIk::MAX_ITERATIONS);
+        for (angle, joint) in q.iter().take(count).zip(&hand.joints) {
+            assert!((joint.lower..=joint.upper).contains(angle));
         }
-        let mut worst = 0.0_f64;
-        for index in 0..343_u32 {
-            let coordinate = |divisor: u32| f64::from(index / divisor % 7) * 0.06 - 0.18;
-            let target = Vector3::new(coordinate(1), coordinate(7), coordinate(49));
-            let middle = case.posture(&[0.5; 4]);
-            let (_, report) = case.solve(&target, &middle, &middle);
-            let nearest = tips.iter().map(|tip| (tip - target).norm()).fold(f64::INFINITY, f64::min);
-            worst = worst.max(report.residual - nearest);
-        }
-        assert!(worst < 1e-3, "finger {finger}: a grid point is {worst} m nearer");
+        let best = (0..40)
+            .map(|_| length(&solver.solve(&chain, &target, &reference, Some(&posture()), mu).0))
+            .fold(length(&witness), f64::min);
+        worse += usize::from(length(&q) > best + 1e-6 + 0.01 * mu);
+        lost += usize::from(length(&q) > best + 1e-3);
     }
+    println!("of {total} targets {worse} were solved better from random starts, {lost} by more than 1 mm");
+    assert!(worse * 20 <= total && lost * 100 <= total, "{worse} worse, {lost} by more than 1 mm, of {total}");
 }
 
 /// The Allegro's open finger has a Jacobian of rank 1: sweeping the target through it must not throw the joints about.
@@ -152,7 +161,7 @@ fn the_open_hand_is_passed_without_a_throw() {
             let sideways = (f64::from(step) * 0.05).sin() * 2e-3;
             let target = tip + Vector3::new(1e-3, sideways, -1e-3);
             let solver = FingerIk::new(case.chain(), &case.hand.joints);
-            let (q, _) = solver.solve(case.chain(), &target, &straight, &last, POSTURE_WEIGHT_MAX);
+            let (q, _) = solver.solve(case.chain(), &target, &straight, Some(&last), POSTURE_WEIGHT_MAX);
             largest = largest.max(distance(&q, &last));
             last = q;
         }

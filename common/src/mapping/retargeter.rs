@@ -4,7 +4,7 @@ use super::{
     Anchor, CartesianMap, FingerSignals, Gain, MappingMode, MappingOutput, MappingParams, ParamError, ThumbGain,
 };
 use crate::hand::{Finger, FingerChain, HandModel, JointMap, MAX_FINGER_JOINTS, MAX_FINGERS, TipFrame};
-use crate::ik::{FingerIk, POSTURE_WEIGHT_MAX, POSTURE_WEIGHT_MIN};
+use crate::ik::{FingerIk, POSTURE_WEIGHT_MAX};
 use crate::master::MasterPose;
 
 /// The whole mapping step, from a human pose to a robot posture.
@@ -96,9 +96,9 @@ impl Retargeter {
                 anchor = self.cartesian.thumb(&pose.geometry, &meeting);
                 out.p_cartesian = palm_from_anatomical * anchor;
                 if self.params.anchor == Anchor::Projected {
-                    let start = self.last_anchor.unwrap_or(posture);
+                    let start = self.last_anchor.as_ref();
                     let (nearest, _) =
-                        self.solvers[slot].solve(chain, &out.p_cartesian, &posture, &start, posture_weight(k_thumb));
+                        self.solvers[slot].solve(chain, &out.p_cartesian, &posture, start, posture_weight(k_thumb));
                     self.last_anchor = Some(nearest);
                     out.p_cartesian = chain.tip(&nearest, TipFrame::Pole);
                     anchor = self.hand.anatomical_from_palm * out.p_cartesian;
@@ -156,8 +156,7 @@ fn blend(
 ) -> [f64; MAX_FINGER_JOINTS] {
     let own = if out.k > 0.0 {
         out.p_input = out.p_joint * (1.0 - out.k) + out.p_cartesian * out.k;
-        let (own, report) =
-            solver.solve(chain, &out.p_input, posture, &last.unwrap_or(*posture), posture_weight(out.k));
+        let (own, report) = solver.solve(chain, &out.p_input, posture, last.as_ref(), posture_weight(out.k));
         out.ik = report;
         out.p = chain.tip(&own, TipFrame::Pole);
         own
@@ -173,8 +172,11 @@ fn blend(
     own
 }
 
+/// mu where only the tip counts, m/rad.
+const POSTURE_WEIGHT_CARTESIAN: f64 = 2e-5;
+
 /// How much the posture weighs at gain k: from most in the joint phase to least in the Cartesian phase, where only the
 /// tip counts.
 fn posture_weight(k: f64) -> f64 {
-    POSTURE_WEIGHT_MAX * (POSTURE_WEIGHT_MIN / POSTURE_WEIGHT_MAX).powf(k)
+    POSTURE_WEIGHT_MAX * (POSTURE_WEIGHT_CARTESIAN / POSTURE_WEIGHT_MAX).powf(k)
 }

@@ -102,7 +102,7 @@ impl FingerMessage {
             p: point(self.p),
             e_q: self.e_q.into(),
             e_c: self.e_c.into(),
-            ik: IkReport { status, iterations: 0, residual: self.residual.into() },
+            ik: IkReport { status, residual: self.residual.into(), ..IkReport::default() },
         })
     }
 

@@ -1,0 +1,277 @@
+//! One local optimum of the weighted sum: a primal-dual Newton method with box constraints.
+
+#![allow(clippy::needless_range_loop, reason = "rows and columns are read better by index")]
+
+use nalgebra::Vector3;
+
+use super::{Angles, N};
+use crate::hand::{FingerChain, TipFrame};
+
+// Largest step of a joint in one iteration, rad: the tip is then at most 5 mm beside its linear prediction.
+const RADIUS: f64 = 0.35;
+// A Newton step below sqrt(LAST_STEP mu), rad, is the last: the 0.1 m/rad^2 that the finger is curved make of it a miss
+// that weighs like 1e-4 rad of posture. At most MAX_LAST_STEP, for the posture's own sake.
+const LAST_STEP: f64 = 1e-3;
+const MAX_LAST_STEP: f64 = 1e-4;
+// A rise of the weighted sum by this much (m^2) turns a step down: 3 mm off from a point that was exact.
+const RISE: f64 = 5e-6;
+// After that many iterations less and less of a rise is allowed: two linear predictions may send each other in a circle.
+const PATIENCE: u16 = 5;
+
+/// The sum to minimise, `1/2 ||F(q) - target||^2 + 1/2 weight ||q - reference||^2` in the box `lower..upper`.
+pub(super) struct Problem<'a> {
+    pub(super) chain: &'a FingerChain,
+    pub(super) target: Vector3<f64>,
+    pub(super) reference: Angles,
+    /// mu^2, m²/rad².
+    pub(super) weight: f64,
+    pub(super) lower: &'a Angles,
+    pub(super) upper: &'a Angles,
+}
+
+/// Where a descent ended.
+#[derive(Clone, Copy)]
+pub(super) struct Optimum {
+    pub(super) q: Angles,
+    /// F(q) - target, m.
+    pub(super) residual: f64,
+    /// The weighted sum, m².
+    pub(super) cost: f64,
+    pub(super) iterations: u16,
+    pub(super) converged: bool,
+}
+
+type Square = [[f64; N]; N];
+
+struct State {
+    residual: Vector3<f64>,
+    jacobian: [Vector3<f64>; N],
+    axes: [Vector3<f64>; N],
+    cost: f64,
+}
+
+impl Problem<'_> {
+    pub(super) fn cost(&self, residual: &Vector3<f64>, q: &Angles) -> f64 {
+        let posture: f64 = q.iter().zip(&self.reference).map(|(a, b)| (a - b).powi(2)).sum();
+        0.5 * (residual.norm_squared() + self.weight * posture)
+    }
+
+    fn residual(&self, q: &Angles) -> Vector3<f64> {
+        self.chain.tip(&q[..self.chain.joints.len()], TipFrame::Pole) - self.target
+    }
+
+    fn state(&self, q: &Angles) -> State {
+        let (tip, jacobian, axes) = self.chain.differential(&q[..self.chain.joints.len()], TipFrame::Pole);
+        let residual = tip - self.target;
+        State {
+            residual,
+            jacobian: std::array::from_fn(|slot| jacobian.column(slot).into()),
+            axes,
+            cost: self.cost(&residual, q),
+        }
+    }
+
+    pub(super) fn clip(&self, q: &Angles) -> Angles {
+        std::array::from_fn(|slot| q[slot].max(self.lower[slot]).min(self.upper[slot]))
+    }
+
+    /// Follows the valley down from `start`, for at most `budget` iterations.
+    ///
+    /// With a small mu the valley of postures that reach the target is narrow and curved, and the residual's share of
+    /// the Hessian, `sum residual_i d2F_i`, is garbage off its floor. So the multiplier is kept apart from the
+    /// residual, as in an augmented Lagrangian: `rho`, the residual that the last step predicted for its end. The
+    /// speed of convergence is then the same for every mu.
+    pub(super) fn descend(&self, start: &Angles, budget: u16) -> Optimum {
+        let count = self.chain.joints.len();
+        let mut q = self.clip(start);
+        let mut state = self.state(&q);
+        let mut best =
+            Optimum { q, residual: state.residual.norm(), cost: state.cost, iterations: 0, converged: false };
+        let last_step = (LAST_STEP * self.weight.sqrt()).sqrt().min(MAX_LAST_STEP);
+        let (mut radius, mut rise) = (RADIUS, RISE);
+        let mut rho: Option<Vector3<f64>> = None;
+        let mut active = [false; N];
+        for iteration in 1..=budget {
+            let gradient: Angles = std::array::from_fn(|slot| {
+                state.jacobian[slot].dot(&state.residual) + self.weight * (q[slot] - self.reference[slot])
+            });
+            let low: Angles = std::array::from_fn(|slot| (self.lower[slot] - q[slot]).max(-radius));
+            let high: Angles = std::array::from_fn(|slot| (self.upper[slot] - q[slot]).min(radius));
+            let mut gauss = [[0.0; N]; N];
+            for row in 0..count {
+                for column in 0..=row {
+                    gauss[row][column] = state.jacobian[row].dot(&state.jacobian[column]);
+                }
+                gauss[row][row] += self.weight;
+            }
+            let predicted =
+                |step: &Angles| (0..count).fold(state.residual, |sum, slot| sum + state.jacobian[slot] * step[slot]);
+            let multiplier = rho.unwrap_or_else(|| {
+                box_step(count, &gauss, &gradient, &low, &high, &mut active)
+                    .map_or(state.residual, |step| predicted(&step))
+            });
+            let mut newton = gauss;
+            for (row, own) in newton.iter_mut().enumerate().take(count) {
+                // d2F / dq_row dq_column = axis_column x J_row for column <= row.
+                let lever = state.jacobian[row].cross(&multiplier);
+                for column in 0..=row {
+                    own[column] += state.axes[column].dot(&lever);
+                }
+            }
+            let exact = box_step(count, &newton, &gradient, &low, &high, &mut active);
+            let is_newton = exact.is_some();
+            // The Gauss-Newton matrix is positive definite whatever comes.
+            let Some(step) = exact.or_else(|| box_step(count, &gauss, &gradient, &low, &high, &mut active)) else {
+                break;
+            };
+            let trial = self.clip(&std::array::from_fn(|slot| q[slot] + step[slot]));
+            let moved = step.iter().fold(0.0_f64, |largest, step| largest.max(step.abs()));
+            if moved < if is_newton { last_step.min(0.5 * radius) } else { 1e-9 } {
+                let residual = self.residual(&trial);
+                let cost = self.cost(&residual, &trial);
+                // Below rounding either is as good.
+                if cost <= best.cost * (1.0 + 1e-9) {
+                    best = Optimum { q: trial, residual: residual.norm(), cost, ..best };
+                }
+                return Optimum { iterations: iteration, converged: true, ..best };
+            }
+            let ahead = self.state(&trial);
+            if iteration > PATIENCE {
+                rise *= 0.25;
+            }
+            if ahead.cost > state.cost + rise {
+                radius = 0.25 * moved;
+                continue;
+            }
+            radius = if ahead.cost > state.cost { 0.5 * moved } else { (2.0 * radius).min(RADIUS) };
+            rho = Some(predicted(&step));
+            (q, state) = (trial, ahead);
+            if state.cost < best.cost {
+                best = Optimum { q, residual: state.residual.norm(), cost: state.cost, ..best };
+            }
+        }
+        Optimum { iterations: budget, ..best }
+    }
+}
+
+/// `argmin g'd + 1/2 d'Hd` for `low <= d <= high` by an active-set method; `active` is the guess of the joints that end
+/// on a bound, and becomes the set found. `None` if `hessian` (its lower triangle is read) is not positive definite on
+/// the free joints.
+fn box_step(
+    count: usize,
+    hessian: &Square,
+    gradient: &Angles,
+    low: &Angles,
+    high: &Angles,
+    active: &mut [bool; N],
+) -> Option<Angles> {
+    let entry = |row: usize, column: usize| if row >= column { hessian[row][column] } else { hessian[column][row] };
+    let mut step = [0.0; N];
+    for slot in 0..count {
+        if active[slot] {
+            step[slot] = if gradient[slot] > 0.0 { low[slot] } else { high[slot] };
+        }
+    }
+    // Every pass fixes a joint or frees one; a cycle, which rounding can make, ends with the last feasible step.
+    for _ in 0..4 * N {
+        let free = solve_free(count, hessian, gradient, &step, active)?;
+        // As far towards it as the bounds allow: the first joint to hit one stays there.
+        let mut hit = None;
+        let mut share = 1.0;
+        for slot in 0..count {
+            if active[slot] {
+                continue;
+            }
+            let way = free[slot] - step[slot];
+            let bound = if free[slot] < low[slot] {
+                low[slot]
+            } else if free[slot] > high[slot] {
+                high[slot]
+            } else {
+                continue;
+            };
+            let part = if way == 0.0 { 0.0 } else { ((bound - step[slot]) / way).clamp(0.0, 1.0) };
+            if hit.is_none() || part < share {
+                (hit, share) = (Some((slot, bound)), part);
+            }
+        }
+        for slot in 0..count {
+            if !active[slot] {
+                step[slot] += share * (free[slot] - step[slot]);
+            }
+        }
+        if let Some((slot, bound)) = hit {
+            active[slot] = true;
+            step[slot] = bound;
+            continue;
+        }
+        // Free the joint that its bound holds back against the slope the most.
+        let mut release = None;
+        let mut steepest = 0.0;
+        for slot in 0..count {
+            if active[slot] && low[slot] < high[slot] {
+                let slope = (0..count).fold(gradient[slot], |sum, other| sum + entry(slot, other) * step[other]);
+                let inward = if step[slot] <= low[slot] { -slope } else { slope };
+                if inward > steepest {
+                    (release, steepest) = (Some(slot), inward);
+                }
+            }
+        }
+        match release {
+            Some(slot) => active[slot] = false,
+            None => break,
+        }
+    }
+    Some(step)
+}
+
+/// Minimiser over the joints that are not active, the others being as in `step`: Cholesky, row by row.
+fn solve_free(count: usize, hessian: &Square, gradient: &Angles, step: &Angles, active: &[bool; N]) -> Option<Angles> {
+    let mut factor = [[0.0; N]; N];
+    let mut out = *step;
+    for row in 0..count {
+        if active[row] {
+            continue;
+        }
+        let mut right = -gradient[row];
+        for other in 0..count {
+            if active[other] {
+                let value = if row >= other { hessian[row][other] } else { hessian[other][row] };
+                right -= value * step[other];
+            }
+        }
+        for column in 0..row {
+            if active[column] {
+                continue;
+            }
+            let mut sum = hessian[row][column];
+            for inner in 0..column {
+                sum -= factor[row][inner] * factor[column][inner];
+            }
+            factor[row][column] = sum * factor[column][column];
+            right -= factor[row][column] * out[column];
+        }
+        let mut pivot = hessian[row][row];
+        for inner in 0..row {
+            pivot -= factor[row][inner] * factor[row][inner];
+        }
+        if pivot <= 1e-13 * hessian[row][row].abs() {
+            return None;
+        }
+        // The diagonal holds its reciprocal.
+        factor[row][row] = 1.0 / pivot.sqrt();
+        out[row] = right * factor[row][row];
+    }
+    for row in (0..count).rev() {
+        if active[row] {
+            continue;
+        }
+        for below in row + 1..count {
+            if !active[below] {
+                out[row] -= factor[below][row] * out[below];
+            }
+        }
+        out[row] *= factor[row][row];
+    }
+    Some(out)
+}
