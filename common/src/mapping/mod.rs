@@ -10,8 +10,10 @@
 //! | [`params`](MappingParams) | every parameter, the two presets, validation |
 //! | [`gain`](Gain) | Eq. 14 |
 //! | [`cartesian`](CartesianMap) | Eq. 9-12 |
+//! | [`baseline`](Baseline) | the objectives of AnyTeleop and DexPilot, to compare with |
 //! | [`retargeter`](Retargeter) | the whole step: a [`crate::master::MasterPose`] in, a [`MappingOutput`] out |
 
+mod baseline;
 mod cartesian;
 mod gain;
 mod params;
@@ -19,6 +21,7 @@ mod retargeter;
 
 use nalgebra::Vector3;
 
+pub use baseline::{Baseline, BaselineParams, Minimum, TipObjective};
 pub use cartesian::CartesianMap;
 pub use gain::Gain;
 pub use params::{Anchor, GainShape, MappingMode, MappingParams, ParamError, ThumbGain};
@@ -28,6 +31,10 @@ use crate::hand::{Finger, JointVector, MAX_FINGERS};
 use crate::ik::IkReport;
 
 /// Every intermediate signal of one slave finger. Positions are tip poles in the palm frame, m.
+///
+/// In the modes `vector` and `dexpilot`, which blend nothing, `k` is 1 while `dexpilot` projects the finger onto the
+/// thumb and otherwise 0, and `p_cartesian` and `p_input` both are the target of the tip: the thumb's tip for a
+/// projected finger, otherwise the end of the scaled vector from the wrist.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct FingerSignals {
     /// Which finger.

@@ -1,5 +1,7 @@
 use serde::{Deserialize, Serialize};
 
+use super::BaselineParams;
+
 /// Which mapping drives the hand.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
@@ -11,6 +13,10 @@ pub enum MappingMode {
     Joint,
     /// Cartesian mapping only: the positions of the tips.
     Cartesian,
+    /// AnyTeleop's objective, see [`Baseline`](super::Baseline).
+    Vector,
+    /// DexPilot's objective, see [`Baseline`](super::Baseline).
+    DexPilot,
 }
 
 /// What the fingers' Cartesian targets hang on (p_ST in Eq. 9).
@@ -66,6 +72,8 @@ pub struct MappingParams {
     pub gain: GainShape,
     /// The thumb's gain.
     pub thumb_gain: ThumbGain,
+    /// Of the modes `vector` and `dexpilot`.
+    pub baseline: BaselineParams,
 }
 
 /// A parameter that cannot be used.
@@ -113,6 +121,7 @@ impl Default for MappingParams {
             joint_map: "split".to_owned(),
             gain: GainShape::Cosine,
             thumb_gain: ThumbGain::Closest,
+            baseline: BaselineParams::default(),
         }
     }
 }
@@ -147,6 +156,9 @@ impl MappingParams {
         };
         range("r1", self.r1, self.r1 > 0.0 && self.r1 < 0.3, "in metres of the human hand, above 0 and below 0.3")?;
         range("r2", self.r2, self.r2 >= self.r1 + 0.001 && self.r2 < 0.5, "at least r1 + 0.001 m and below 0.5 m")?;
-        range("scale", self.scale, self.scale >= 0.1 && self.scale <= 10.0, "from 0.1 to 10")
+        range("scale", self.scale, self.scale >= 0.1 && self.scale <= 10.0, "from 0.1 to 10")?;
+        let BaselineParams { scale, low_pass } = self.baseline;
+        range("baseline.scale", scale, (0.1..=10.0).contains(&scale), "from 0.1 to 10")?;
+        range("baseline.low_pass", low_pass, low_pass > 0.0 && low_pass <= 1.0, "above 0 and at most 1 (off)")
     }
 }
