@@ -9,7 +9,7 @@ use std::io::BufReader;
 
 use report::report;
 use teleop_common::hand::{HandModel, HandSide, JointVector, TipFrame};
-use teleop_common::mapping::{Anchor, MappingParams, Retargeter};
+use teleop_common::mapping::{Anchor, MappingMode, MappingParams, Retargeter};
 use teleop_common::master::{Calibrator, Fitter, Gesture, MasterGeometry, MasterPose};
 use teleop_common::recording::{FrameData, LastLine, RecordingReader};
 use teleop_common::testing::shared_data;
@@ -33,11 +33,14 @@ fn main() {
             black_box(chain.tip_and_jacobian(&chain.select(q), TipFrame::Pole));
         }
     });
+    let of = |mode| MappingParams { mode, ..MappingParams::default() };
     let reference = MappingParams { anchor: Anchor::Reference, ..MappingParams::default() };
     for (name, params) in [
         ("default", MappingParams::default()),
         ("paper", MappingParams::paper()),
         ("default, no projection", reference),
+        ("vector", of(MappingMode::Vector)),
+        ("dexpilot", of(MappingMode::DexPilot)),
     ] {
         let mut retargeter = Retargeter::new(hand.clone(), params).unwrap();
         report(&format!("whole hand, tour, {name}"), &tour, |pose| {
@@ -45,6 +48,12 @@ fn main() {
         });
     }
     let Some(recording) = recording() else { return };
+    for mode in [MappingMode::Vector, MappingMode::DexPilot] {
+        let mut retargeter = Retargeter::new(hand.clone(), of(mode)).unwrap();
+        report(&format!("whole hand, recording, {mode:?}"), &recording, |pose| {
+            black_box(retargeter.map(pose));
+        });
+    }
     for side in [HandSide::Right, HandSide::Left] {
         let mut retargeter = Retargeter::new(HandModel::allegro_v4(side), MappingParams::default()).unwrap();
         report(&format!("whole hand, recording, {}", side.name()), &recording, |pose| {

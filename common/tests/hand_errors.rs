@@ -131,7 +131,7 @@ fn broken_description_is_refused_by_name() {
     let row = "\"joint_5.0\" = { terms = [{ from = \"middle.1\" }] }\n";
     let cases: &[(&str, &str, &str)] = &[
         // Syntax and keys.
-        ("[joints]", "[joints", "description: line 13:"),
+        ("[joints]", "[joints", "description: line 14:"),
         ("side = \"right\"\n", "", "description: line 1: missing field `side`"),
         ("side = \"right\"", "side = \"both\"", "description: line 4: unknown variant `both`"),
         ("side = \"right\"", "side = \"right\"\nsize = 1", "description: line 5: unknown field `size`"),
@@ -236,6 +236,9 @@ fn broken_description_is_refused_by_name() {
              name = \"ring\"",
             "finger 'little': base link 'link_10.0' is not between",
         ),
+        // The wrist, in metres.
+        ("-0.095]", "-95.0]", "anatomical.wrist: [0.0, 0.0, -95.0] must be within 1 m of the root link"),
+        ("-0.095]", "nan]", "anatomical.wrist: [0.0, 0.0, NaN] must be within"),
         // Joint maps.
         (row, "", "joint_map.carry: no row for joint 'joint_5.0'"),
         (

@@ -288,9 +288,10 @@ fn a_hand_without_ring_and_a_master_with_more_fingers_agree() {
 proptest! {
     #[test]
     fn any_posture_gives_a_posture_inside_the_limits(
-        q in prop::array::uniform20(-6.3..6.3_f64), paper: bool, mode in 0..3_usize,
+        q in prop::array::uniform20(-6.3..6.3_f64), paper: bool, mode in 0..5_usize,
     ) {
-        let mode = [MappingMode::Combined, MappingMode::Joint, MappingMode::Cartesian][mode];
+        use MappingMode as M;
+        let mode = [M::Combined, M::Joint, M::Cartesian, M::Vector, M::DexPilot][mode];
         let preset = if paper { MappingParams::paper() } else { MappingParams::default() };
         let output = retargeter(MappingParams { mode, ..preset }).map(&pose(q));
         for (q, joint) in output.q.iter().zip(&hand().joints) {

@@ -23,7 +23,8 @@ Examples:
 Configuration file (--config FILE), every value optional:
   preset = \"default\"          # or \"paper\"
   [mapping]                   # mode, r1, r2 (m), scale, anchor, joint_map, gain, thumb_gain, tuning (operator or
-  r2 = 0.06                   # fixed); an r1, r2 or scale given here holds whatever the operator's tuning says
+  r2 = 0.06                   # fixed); an r1, r2 or scale given here holds whatever the operator's tuning says;
+                              # baseline = { scale, low_pass } of the modes vector and dexpilot
   [control]                   # rate_hz, hold_after_s, max_age_s, smoothing_s, engage_speed_rad_s, engage_ramp_s,
   hold_after_s = 0.2          # tip_overlap_m, velocity_scale, acceleration_scale
 
@@ -71,6 +72,11 @@ pub enum Mode {
     Joint,
     /// Fingertip positions only.
     Cartesian,
+    /// Baseline: the objective of AnyTeleop.
+    Vector,
+    /// Baseline: the objective of DexPilot.
+    #[value(name = "dexpilot")]
+    DexPilot,
 }
 
 /// The hand and its mapping.
@@ -190,6 +196,8 @@ impl HandArgs {
             Mode::Combined => MappingMode::Combined,
             Mode::Joint => MappingMode::Joint,
             Mode::Cartesian => MappingMode::Cartesian,
+            Mode::Vector => MappingMode::Vector,
+            Mode::DexPilot => MappingMode::DexPilot,
         });
         Overrides { preset: self.preset.clone(), mode, rate: self.rate }
     }

@@ -250,6 +250,8 @@ impl HandSource {
 
 #[cfg(test)]
 mod tests {
+    use teleop_common::mapping::BaselineParams;
+
     use super::*;
 
     fn parse(text: &str) -> Result<Config, ConfigError> {
@@ -263,6 +265,9 @@ mod tests {
         assert_eq!(config.mapping, MappingParams { r2: 0.05, pinned, ..MappingParams::paper() });
         assert_eq!(config.control.rate, 500.0);
         assert_eq!(parse("").unwrap().mapping, MappingParams::default());
+        let config = parse("[mapping]\nmode = \"dexpilot\"\n[mapping.baseline]\nlow_pass = 0.2").unwrap();
+        let baseline = BaselineParams { low_pass: 0.2, ..BaselineParams::default() };
+        assert_eq!(config.mapping, MappingParams { mode: MappingMode::DexPilot, baseline, ..MappingParams::default() });
     }
 
     #[test]
@@ -282,6 +287,10 @@ mod tests {
             ("[mapping]\nr2 = 0.01", "mapping.r2 = 0.01 is not usable: it must be at least r1"),
             ("[mapping]\nradius = 1", "radius"),
             ("[mapping]\ntuning = \"mine\"", "expected `operator` or `fixed`"),
+            (
+                "[mapping]\nbaseline = { scale = 0 }",
+                "mapping.baseline.scale = 0 is not usable: it must be from 0.1 to 10",
+            ),
             ("[control]\nrate_hz = 0", "control.rate_hz = 0 is not usable: it must be from 20 to 2000 Hz"),
             ("[control]\nhold_after_s = nan", "control.hold_after_s = NaN"),
             ("speed = 3", "speed"),

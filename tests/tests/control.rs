@@ -9,7 +9,7 @@ use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use teleop_common::hand::{HandModel, HandSide, JointVector};
-use teleop_common::mapping::MappingParams;
+use teleop_common::mapping::{MappingMode, MappingParams};
 use teleop_common::master::{Gesture, MasterGeometry, MasterPose};
 use teleop_common::mode::Mode;
 use teleop_common::net::Arrival;
@@ -118,10 +118,17 @@ fn speed(before: &TickRecord, after: &TickRecord) -> f64 {
 
 #[test]
 fn a_tick_does_not_allocate() {
+    for mode in [MappingMode::Combined, MappingMode::Vector, MappingMode::DexPilot] {
+        assert_no_allocation(MappingParams { mode, ..MappingParams::default() });
+    }
+}
+
+fn assert_no_allocation(mapping: MappingParams) {
     const ROBOT: u64 = 1;
     /// The operator's clock, from this one's.
     const AHEAD: u64 = 3_600_000 * MS;
-    let mut bench = Bench::right();
+    let mode = mapping.mode;
+    let mut bench = Bench::new(HandSide::Right, mapping);
     let (input, mut slot) = triple_buffer::triple_buffer(&None);
     let gate = GateParams { max_age: Duration::from_millis(250), release_after: HOLD_AFTER };
     let mut receiver = Receiver::new(ROBOT, gate, input);
@@ -154,7 +161,9 @@ fn a_tick_does_not_allocate() {
     run(2000);
     let ticks = 100_000;
     let count = allocations(|| run(ticks));
-    println!("{ticks} ticks with receiving, decoding and the simulated hand: {count} allocations; modes {modes:?}");
+    println!(
+        "{mode:?}: {ticks} ticks with receiving, decoding and the simulated hand: {count} allocations; modes {modes:?}"
+    );
     assert_eq!(count, 0);
     // It was the real thing: followed, held, and followed again.
     assert!(modes[Mode::Engaged as usize] > 90_000 && modes[Mode::Holding as usize] > 500, "{modes:?}");
@@ -261,9 +270,12 @@ fn any_pose(dice: &mut Dice) -> MasterPose {
 
 #[test]
 fn no_stream_of_poses_breaks_a_limit() {
-    for (side, mapping, seed) in
-        [(HandSide::Right, MappingParams::default(), 1), (HandSide::Left, MappingParams::paper(), 2)]
-    {
+    let dexpilot = MappingParams { mode: MappingMode::DexPilot, ..MappingParams::default() };
+    for (side, mapping, seed) in [
+        (HandSide::Right, MappingParams::default(), 1),
+        (HandSide::Left, MappingParams::paper(), 2),
+        (HandSide::Right, dexpilot, 3),
+    ] {
         let mut bench = Bench::new(side, mapping);
         let mut dice = Dice::new(seed, 0);
         let (mut sample, mut sequence, mut wait) = (None, 0, 0_u64);

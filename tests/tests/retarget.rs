@@ -141,12 +141,14 @@ fn assert_row(row: &Value, (t, q_master): &(f64, [f64; 20]), hand: &HandModel, m
         let (own, joint) = (chain.select(&q), chain.select(&q_joint));
         let k = of(row, "k", finger);
         assert!((0.0..=1.0).contains(&k), "{k}");
+        let baseline = matches!(mode, "vector" | "dexpilot");
         match mode {
-            "joint" => assert_eq!(k, 0.0),
+            "joint" | "vector" => assert_eq!(k, 0.0),
             "cartesian" => assert_eq!(k, 1.0),
+            "dexpilot" => assert!(k == 0.0 || k == 1.0),
             _ => {}
         }
-        if k == 0.0 {
+        if k == 0.0 && !baseline {
             assert_eq!(own, joint, "t {t}: k of the {} is 0", finger.name());
         }
         if finger != Finger::Thumb {
@@ -156,7 +158,8 @@ fn assert_row(row: &Value, (t, q_master): &(f64, [f64; 20]), hand: &HandModel, m
         let (p, p_joint) = (chain.tip(&own, TipFrame::Pole), chain.tip(&joint, TipFrame::Pole));
         assert_near("p", (point(row, "p", finger) - p).norm(), 0.0);
         assert_near("p_joint", (point(row, "p_joint", finger) - p_joint).norm(), 0.0);
-        let blend = p_joint * (1.0 - k) + point(row, "p_cartesian", finger) * k;
+        let weight = if baseline { 1.0 } else { k };
+        let blend = p_joint * (1.0 - weight) + point(row, "p_cartesian", finger) * weight;
         assert_near("p_input", (point(row, "p_input", finger) - blend).norm(), 0.0);
         let e_q = own.iter().zip(&joint).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt();
         assert_near("e_q", of(row, "e_q", finger), e_q);
@@ -170,7 +173,7 @@ fn every_row_keeps_the_contract() {
     let job = Job::new(lines(&motion));
     for side in [HandSide::Right, HandSide::Left] {
         let hand = HandModel::allegro_v4(side);
-        for mode in ["combined", "joint", "cartesian"] {
+        for mode in ["combined", "joint", "cartesian", "vector", "dexpilot"] {
             for preset in ["default", "paper"] {
                 let rows = job.rows(&["--hand", side.name(), "--mode", mode, "--preset", preset]);
                 assert_eq!(rows.len(), motion.len());

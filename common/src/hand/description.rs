@@ -26,6 +26,9 @@ pub(super) struct Anatomical {
     pub(super) radial: SignedAxis,
     pub(super) distal: SignedAxis,
     pub(super) palmar: SignedAxis,
+    /// Where a human wrist would be, m, in the root link's frame.
+    #[serde(default)]
+    pub(super) wrist: [f64; 3],
 }
 
 #[derive(Clone, Copy, Debug, Deserialize)]

@@ -36,6 +36,11 @@ impl HandModel {
         })?;
         check_name("name", &description.name)?;
         let anatomical_from_palm = anatomical(&description.anatomical, description.side)?;
+        let wrist = Vector3::from(description.anatomical.wrist);
+        if !(0.0..1.0).contains(&wrist.norm()) {
+            let problem = format!("{:?} must be within 1 m of the root link", description.anatomical.wrist);
+            return Err(HandError::description("anatomical.wrist", problem));
+        }
         let joints = joints(&tree, &description.joints)?;
         let wire: HashMap<&str, usize> =
             joints.iter().enumerate().map(|(index, joint)| (joint.name.as_str(), index)).collect();
@@ -65,6 +70,7 @@ impl HandModel {
             joints,
             fingers,
             anatomical_from_palm,
+            wrist,
             joint_maps,
             links,
             warnings: tree.warnings,

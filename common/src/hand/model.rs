@@ -207,6 +207,8 @@ pub struct HandModel {
     pub fingers: Vec<FingerChain>,
     /// Rotation (a reflection too for a left hand) from the palm frame into O_SW.
     pub anatomical_from_palm: Matrix3<f64>,
+    /// Where the wrist of a human hand of this size would be, in the palm frame, m.
+    pub wrist: Vector3<f64>,
     /// The joint maps the description offers.
     pub joint_maps: Vec<JointMap>,
     /// All links with their shapes, for drawing: the root (the palm frame) first, parents before children.

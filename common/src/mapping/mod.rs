@@ -13,8 +13,10 @@
 //! | [`contact`](Contact) | a human touch is a robot touch, whatever distance the tracker reads |
 //! | [`tuning`](Tuning) | what is known about one operator |
 //! | [`tuner`](tune()) | scales and radii for one operator and one robot hand |
+//! | [`baseline`](Baseline) | the objectives of AnyTeleop and DexPilot, to compare with |
 //! | [`retargeter`](Retargeter) | the whole step: a [`crate::master::MasterPose`] in, a [`MappingOutput`] out |
 
+mod baseline;
 mod cartesian;
 mod contact;
 mod gain;
@@ -25,6 +27,7 @@ mod tuning;
 
 use nalgebra::Vector3;
 
+pub use baseline::{Baseline, BaselineParams, Minimum, TipObjective};
 pub use cartesian::CartesianMap;
 pub use contact::Contact;
 pub use gain::Gain;
@@ -37,6 +40,10 @@ use crate::hand::{Finger, JointVector, MAX_FINGERS};
 use crate::ik::IkReport;
 
 /// Every intermediate signal of one slave finger. Positions are tip poles in the palm frame, m.
+///
+/// In the modes `vector` and `dexpilot`, which blend nothing, `k` is 1 while `dexpilot` projects the finger onto the
+/// thumb and otherwise 0, and `p_cartesian` and `p_input` both are the target of the tip: the thumb's tip for a
+/// projected finger, otherwise the end of the scaled vector from the wrist.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct FingerSignals {
     /// Which finger.

@@ -2,6 +2,7 @@ use serde::{Deserialize, Serialize};
 
 use super::tuning::{MIN_BAND, Tuning};
 use crate::hand::MAX_FINGERS;
+use super::BaselineParams;
 
 /// Which mapping drives the hand.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -14,6 +15,10 @@ pub enum MappingMode {
     Joint,
     /// Cartesian mapping only: the positions of the tips.
     Cartesian,
+    /// AnyTeleop's objective, see [`Baseline`](super::Baseline).
+    Vector,
+    /// DexPilot's objective, see [`Baseline`](super::Baseline).
+    DexPilot,
 }
 
 /// What the fingers' Cartesian targets hang on (p_ST in Eq. 9).
@@ -96,6 +101,8 @@ pub struct MappingParams {
     /// Those of the three that hold in any case.
     #[serde(skip)]
     pub pinned: Pinned,
+    /// Of the modes `vector` and `dexpilot`.
+    pub baseline: BaselineParams,
 }
 
 /// A parameter that cannot be used.
@@ -145,6 +152,7 @@ impl Default for MappingParams {
             thumb_gain: ThumbGain::Closest,
             tuning: TuningUse::Operator,
             pinned: Pinned::default(),
+            baseline: BaselineParams::default(),
         }
     }
 }
@@ -208,6 +216,9 @@ impl MappingParams {
         };
         range("r1", self.r1, self.r1 > 0.0 && self.r1 < 0.3, "in metres of the human hand, above 0 and below 0.3")?;
         range("r2", self.r2, self.r2 >= self.r1 + 0.001 && self.r2 < 0.5, "at least r1 + 0.001 m and below 0.5 m")?;
-        range("scale", self.scale, self.scale >= 0.1 && self.scale <= 10.0, "from 0.1 to 10")
+        range("scale", self.scale, self.scale >= 0.1 && self.scale <= 10.0, "from 0.1 to 10")?;
+        let BaselineParams { scale, low_pass } = self.baseline;
+        range("baseline.scale", scale, (0.1..=10.0).contains(&scale), "from 0.1 to 10")?;
+        range("baseline.low_pass", low_pass, low_pass > 0.0 && low_pass <= 1.0, "above 0 and at most 1 (off)")
     }
 }

@@ -1,7 +1,8 @@
 use nalgebra::Vector3;
 
 use super::{
-    Anchor, CartesianMap, FingerSignals, Gain, MappingMode, MappingOutput, MappingParams, ParamError, ThumbGain,
+    Anchor, Baseline, CartesianMap, FingerSignals, Gain, MappingMode, MappingOutput, MappingParams, ParamError,
+    ThumbGain,
 };
 use crate::hand::{Finger, FingerChain, HandModel, JointMap, MAX_FINGER_JOINTS, MAX_FINGERS, TipFrame};
 use crate::ik::{FingerIk, POSTURE_WEIGHT_MAX};
@@ -22,6 +23,7 @@ pub struct Retargeter {
     // Last solution per finger, and of the thumb's projection.
     last: [Option<[f64; MAX_FINGER_JOINTS]>; MAX_FINGERS],
     last_anchor: Option<[f64; MAX_FINGER_JOINTS]>,
+    baseline: Option<Baseline>,
 }
 
 impl Retargeter {
@@ -40,6 +42,7 @@ impl Retargeter {
             cartesian: CartesianMap::new(&hand, params.scale),
             gain: Gain { r1: params.r1, r2: params.r2, shape: params.gain },
             solvers: hand.fingers.iter().map(|chain| FingerIk::new(chain, &hand.joints)).collect(),
+            baseline: Baseline::new(&hand, params.mode, params.baseline),
             hand,
             params,
             joint_map,
@@ -69,9 +72,12 @@ impl Retargeter {
     pub fn reset(&mut self) {
         self.last = [None; MAX_FINGERS];
         self.last_anchor = None;
+        if let Some(baseline) = &mut self.baseline {
+            baseline.reset();
+        }
     }
 
-    /// Maps one pose: all of Eq. 1-14.
+    /// Maps one pose: all of Eq. 1-14, or one of the baselines.
     #[must_use]
     pub fn map(&mut self, pose: &MasterPose) -> MappingOutput {
         let q_joint = self.hand.clip(&self.joint_map.apply(&pose.q));
@@ -84,6 +90,11 @@ impl Retargeter {
         let mut signals = Finger::ALL.map(FingerSignals::zero);
         let mut q = q_joint;
         let (k_thumb, closest) = self.gains(&tips, &mut signals);
+
+        if let Some(baseline) = &mut self.baseline {
+            signals[0].delta = closest;
+            return baseline.map(&self.hand, &tips, q_joint, &mut signals);
+        }
 
         // In O_SW. The thumb comes first in the model: the fingers' targets hang on it.
         let mut anchor = Vector3::zeros();
@@ -131,7 +142,7 @@ impl Retargeter {
             out.delta = (tips[Finger::Thumb.index()] - tips[chain.finger.index()]).norm();
             out.k = match self.params.mode {
                 MappingMode::Combined => self.gain.at(out.delta),
-                MappingMode::Joint => 0.0,
+                MappingMode::Joint | MappingMode::Vector | MappingMode::DexPilot => 0.0,
                 MappingMode::Cartesian => 1.0,
             };
             largest = largest.max(out.k);
