@@ -1,5 +1,6 @@
 //! Time of one fit of a whole hand: synthetic keypoints of the gesture tour with tracker noise, and the same
-//! without a last posture; then the real recording, where it is at hand. `cargo bench -p teleop-common --bench fit`.
+//! without a last posture; then the real recording, where it is at hand, without and with the filter.
+//! `cargo bench -p teleop-common --bench fit`.
 #![allow(clippy::print_stdout, clippy::unwrap_used, missing_docs, reason = "a bench reports on the terminal")]
 
 mod report;
@@ -11,7 +12,7 @@ use std::io::BufReader;
 use nalgebra::Vector3;
 use report::report;
 use teleop_common::hand::{Finger, HandSide};
-use teleop_common::master::{Calibrator, Fitter, Gesture, Keypoints, MasterGeometry};
+use teleop_common::master::{Calibrator, Filter, FilterSettings, Fitter, Gesture, Keypoints, MasterGeometry};
 use teleop_common::recording::{FrameData, LastLine, RecordingReader};
 use teleop_common::testing::shared_data;
 
@@ -45,6 +46,11 @@ fn main() {
     let repeated: Vec<Keypoints> = frames.iter().copied().cycle().take(FRAMES).collect();
     report("recording", &repeated, |frame| {
         black_box(fitter.fit(frame));
+    });
+    let mut filter = Filter::new(calibration.geometry, FilterSettings::default());
+    report("filtered", &repeated, |frame| {
+        let fitted = fitter.fit(frame).q;
+        black_box(filter.apply(1.0 / 30.0, frame, &fitted));
     });
 }
 

@@ -14,6 +14,7 @@
 //! | [`mode`] | what the robot is doing |
 //! | [`key`] | key expressions of a robot |
 //! | [`wire`] | the binary messages and their one codec door |
+//! | [`quality`] | how well the robot followed a recorded hand, in figures |
 //! | [`recording`] | recordings of a human hand, line by line: CSV of keypoints, JSON lines |
 //! | [`time`] | monotonic time as a number, clock offset, latency histogram |
 //! | [`testing`] | where tests find recordings |
@@ -27,6 +28,7 @@ pub mod master;
 pub mod mode;
 #[cfg(feature = "net")]
 pub mod net;
+pub mod quality;
 pub mod recording;
 pub mod testing;
 pub mod time;

@@ -31,7 +31,7 @@ fn retargeter(hand: HandModel, mode: MappingMode) -> Retargeter {
 }
 
 fn pose(q: [f64; 20]) -> MasterPose {
-    MasterPose { q, geometry: MasterGeometry::PARADIGMATIC }
+    MasterPose { q, geometry: MasterGeometry::PARADIGMATIC, tuning: None }
 }
 
 fn tips(pose: &MasterPose) -> [Vector3<f64>; MAX_FINGERS] {

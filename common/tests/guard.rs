@@ -34,7 +34,7 @@ fn in_every_gesture_the_tips_are_apart_and_touches_remain_touches() {
             let mut last: Option<(JointVector, JointVector)> = None;
             for n in 0..3000 {
                 let q = gesture.sample(f64::from(n) * 0.01);
-                let mapping = retargeter.map(&MasterPose { q, geometry: MasterGeometry::PARADIGMATIC });
+                let mapping = retargeter.map(&MasterPose { q, geometry: MasterGeometry::PARADIGMATIC, tuning: None });
                 let movable = movable(&mapping);
                 let before = guard.deepest(&hand, &mapping.q);
                 let x = guard.apart(&hand, &mapping.q, &movable);

@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use clap::{Args, Parser, Subcommand};
+use clap::{Args, Parser, Subcommand, ValueEnum};
 use teleop_common::viz::Viewer;
 
 /// Where the robot listens by default.
@@ -95,6 +95,9 @@ pub struct RunArgs {
     /// a whole before it plays, a live hand for 3 s before it is followed
     #[arg(long, value_name = "FILE")]
     pub calibration: Option<PathBuf>,
+    /// Take the tracker's noise out of keypoints; joint angles are sent as they are
+    #[arg(long, value_enum, default_value = "on")]
+    pub filter: Switch,
     /// Where hand data of `--source zenoh` may arrive; repeatable
     #[arg(long, default_value = INPUT_ENDPOINT, value_name = "ENDPOINT")]
     pub listen: Vec<String>,
@@ -153,6 +156,15 @@ pub struct WatchArgs {
     /// Logging.
     #[command(flatten)]
     pub log: LogArgs,
+}
+
+/// On or off.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum Switch {
+    /// Yes.
+    On,
+    /// No.
+    Off,
 }
 
 fn rate(text: &str) -> Result<f64, String> {

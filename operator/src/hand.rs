@@ -4,7 +4,8 @@ use std::time::Duration;
 
 use teleop_common::hand::HandSide;
 use teleop_common::master::{
-    Calibration, CalibrationError, Calibrator, Diagnosis, Fitter, Inspector, MIN_FRAMES, MasterGeometry, MasterPose,
+    Calibration, CalibrationError, Calibrator, Diagnosis, Filter, FilterSettings, Fitter, Inspector, MIN_FRAMES,
+    MasterGeometry, MasterPose,
 };
 use teleop_common::recording::FrameData;
 
@@ -49,6 +50,7 @@ pub enum Refusal {
 pub struct PoseFinder {
     /// For joint angles.
     geometry: MasterGeometry,
+    filtered: bool,
     tracker: Tracker,
     last: Option<Duration>,
 }
@@ -59,7 +61,7 @@ enum Tracker {
     /// Not known whose hand it is.
     Measuring { calibrator: Box<Calibrator>, since: Option<Duration> },
     /// A known hand.
-    Following { fitter: Box<Fitter>, inspector: Inspector, side: HandSide },
+    Following { fitter: Box<Fitter>, filter: Box<Filter>, inspector: Inspector, side: HandSide },
 }
 
 impl Tracker {
@@ -69,6 +71,7 @@ impl Tracker {
 
     fn following(calibration: &Calibration) -> Self {
         Self::Following {
+            filter: Box::new(Filter::new(calibration.geometry, FilterSettings::default())),
             fitter: Box::new(Fitter::new(calibration.geometry, calibration.side)),
             inspector: Inspector::default(),
             side: calibration.side,
@@ -80,19 +83,27 @@ impl PoseFinder {
     /// For joint angles of this hand; keypoints, should they come, are measured for [`MEASURE`] first.
     #[must_use]
     pub fn new(geometry: MasterGeometry) -> Self {
-        Self { geometry, tracker: Tracker::measuring(), last: None }
+        Self { geometry, filtered: true, tracker: Tracker::measuring(), last: None }
     }
 
     /// For joint angles or keypoints of a person that was measured.
     #[must_use]
     pub fn calibrated(calibration: &Calibration) -> Self {
-        Self { geometry: calibration.geometry, tracker: Tracker::following(calibration), last: None }
+        let tracker = Tracker::following(calibration);
+        Self { geometry: calibration.geometry, filtered: true, tracker, last: None }
+    }
+
+    /// The same with or without the [`Filter`], which takes the tracker's noise out of keypoints; it is on at first.
+    #[must_use]
+    pub fn filtered(mut self, filtered: bool) -> Self {
+        self.filtered = filtered;
+        self
     }
 
     /// The pose of `hand`, seen `time` after the start; `jump` if it need not be near the one before.
     pub fn pose(&mut self, time: Duration, hand: &FrameData, jump: bool) -> Posed {
-        let gap = jump || self.last.is_some_and(|last| time.saturating_sub(last) > GAP);
-        self.last = Some(time);
+        let since = time.saturating_sub(self.last.replace(time).unwrap_or(time));
+        let gap = jump || since > GAP;
         let keypoints = match hand {
             FrameData::Joints(q) => {
                 return Posed::Pose {
@@ -126,16 +137,21 @@ impl PoseFinder {
                     }
                 }
             }
-            Tracker::Following { fitter, inspector, side } => {
+            Tracker::Following { fitter, filter, inspector, side } => {
                 inspector.push(keypoints);
                 if let Some(diagnosis) = inspector.diagnose(*side, false) {
+                    filter.reset();
                     return Posed::Refused(Refusal::Diagnosis(diagnosis));
                 }
                 if gap {
                     fitter.reset();
+                    filter.reset();
                 }
                 let fit = fitter.fit(keypoints);
-                let pose = MasterPose { q: fit.q, geometry: *fitter.geometry(), tuning: None };
+                let mut pose = MasterPose { q: fit.q, geometry: *fitter.geometry(), tuning: None };
+                if self.filtered {
+                    pose.q = filter.apply(since.as_secs_f64(), keypoints, &fit.q);
+                }
                 Posed::Pose { pose, residual: Some(fit.residual()) }
             }
         }

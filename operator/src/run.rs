@@ -13,7 +13,7 @@ use teleop_common::net::{Session, Stream};
 use teleop_common::viz::{Level, Scene, Viz};
 
 use crate::calibrate;
-use crate::cli::RunArgs;
+use crate::cli::{RunArgs, Switch};
 use crate::failure::{Failure, OrFail as _, open_session};
 use crate::feedback::Feedback;
 use crate::hand::PoseFinder;
@@ -184,7 +184,7 @@ pub fn run(args: &RunArgs, shutdown: &Shutdown, terminal: &Terminal) -> Result<S
     let (stream, sender) = PoseStream::start(publisher, epoch, Arc::clone(&feedback)).or_runtime()?;
     let pipeline = Pipeline::start(Parts {
         source: open(plan.input, &session, &keys)?,
-        finder: plan.finder,
+        finder: plan.finder.filtered(args.filter == Switch::On),
         sender,
         recorder: record,
         logger: logger.clone(),

@@ -160,6 +160,12 @@ pub struct RetargetArgs {
     /// Sizes of the person's hand, from `operator calibrate`; without it keypoints are measured from the recording
     #[arg(long, value_name = "FILE")]
     pub calibration: Option<PathBuf>,
+    /// Take the tracker's noise out of keypoints; joint angles are mapped as they are
+    #[arg(long, value_enum, default_value = "on")]
+    pub filter: Switch,
+    /// Write how well the robot follows the recorded hand, JSON: pinch gaps, lag, smoothness, limits (lengths in m)
+    #[arg(long, value_name = "FILE")]
+    pub quality: Option<PathBuf>,
     /// Write the time that the mapping takes per frame, JSON
     #[arg(long, value_name = "FILE")]
     pub stats: Option<PathBuf>,

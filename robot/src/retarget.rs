@@ -13,9 +13,10 @@ use indicatif::{ProgressBar, ProgressStyle};
 use teleop_common::hand::{HandModel, JointVector, TipFrame};
 use teleop_common::mapping::{FingerSignals, MappingOutput, Retargeter};
 use teleop_common::master::MasterPose;
+use teleop_common::quality::{Quality, Sample};
 use teleop_common::time::MonoTime;
 
-use self::frames::Frames;
+use self::frames::{Frames, HandFrame};
 use self::output::{Partial, Row};
 use crate::cli::{RetargetArgs, Switch};
 use crate::config::{Config, ConfigError};
@@ -39,26 +40,38 @@ pub fn run(args: &RetargetArgs) -> anyhow::Result<()> {
         Switch::Off => None,
     };
     let started = Instant::now();
-    let frames = Frames::open(&args.input, args.calibration.as_deref(), hand.side)?;
+    let frames = Frames::open(&args.input, args.calibration.as_deref(), hand.side, args.filter == Switch::On)?;
     let mut output = Partial::create(&args.output)?;
+    let mut samples = args.quality.is_some().then(Vec::new);
     let bar = progress(&args.input);
     let mut stats = Stats::default();
 
+    // Writes a frame's row; with conditioning, after the live loop ran until `next`.
+    let mut finish = |frame: &HandFrame, mut mapping: MappingOutput, next: f64| {
+        if let Some(live) = &mut live {
+            mapping = live.run(frame.t, &frame.pose, next, &hand, &mapping);
+        }
+        if let Some(samples) = &mut samples {
+            samples.push(Sample::new(&hand, frame.t, frame.human, &mapping));
+        }
+        output.write(&Row::new(frame.t, &frame.pose, &mapping))
+    };
     // One frame behind: what the live robot commands for a frame is known when the next one comes.
-    let mut waiting: Option<(f64, MasterPose, MappingOutput)> = None;
+    let mut waiting: Option<(HandFrame, MappingOutput)> = None;
     for frame in frames {
-        let (t, pose, read) = frame?;
+        let frame = frame?;
         let begun = Instant::now();
-        let mapped = retargeter.map(&pose);
+        let mapped = retargeter.map(&frame.pose);
         stats.record(begun.elapsed());
-        if let Some((last, before, mapping)) = waiting.replace((t, pose, mapped)) {
-            finish(&mut output, &hand, &mut live, (last, &before, mapping), t)?;
-            stats.period = t - last;
+        let (t, read) = (frame.t, frame.read);
+        if let Some((before, mapping)) = waiting.replace((frame, mapped)) {
+            finish(&before, mapping, t)?;
+            stats.period = t - before.t;
         }
         bar.set_position(read);
     }
-    if let Some((last, pose, mapping)) = waiting {
-        finish(&mut output, &hand, &mut live, (last, &pose, mapping), last + stats.period)?;
+    if let Some((last, mapping)) = waiting {
+        finish(&last, mapping, last.t + stats.period)?;
     }
     output.complete()?;
     bar.finish_and_clear();
@@ -72,21 +85,14 @@ pub fn run(args: &RetargetArgs) -> anyhow::Result<()> {
     if let Some(path) = &args.stats {
         stats.write(path)?;
     }
-    Ok(())
-}
-
-/// Writes one frame's row; with conditioning, after the live loop ran until `next`.
-fn finish(
-    output: &mut Partial,
-    hand: &HandModel,
-    live: &mut Option<Live>,
-    (t, pose, mut mapping): (f64, &MasterPose, MappingOutput),
-    next: f64,
-) -> anyhow::Result<()> {
-    if let Some(live) = live {
-        mapping = live.run(t, pose, next, hand, &mapping);
+    if let (Some(path), Some(samples)) = (&args.quality, samples) {
+        let Some(quality) = Quality::measure(&hand, &samples) else {
+            let text = format!("{}: too short to measure --quality: it needs 3 frames", args.input.display());
+            return Err(UsageError(text).into());
+        };
+        write_json(path, &quality)?;
     }
-    output.write(&Row::new(t, pose, &mapping))
+    Ok(())
 }
 
 /// The live robot in virtual time, with a hand that does exactly what it is told.
@@ -206,10 +212,18 @@ impl Stats {
             "seconds": seconds,
             "step_us": { "p50": self.quantile(0.5), "p99": self.quantile(0.99), "max": self.quantile(1.0) },
         });
-        let file = File::create(path).with_context(|| format!("cannot write {}", path.display()))?;
-        let mut file = BufWriter::new(file);
-        writeln!(file, "{text}").and_then(|()| file.flush()).with_context(|| format!("cannot write {}", path.display()))
+        write_json(path, &text)
     }
+}
+
+fn write_json(path: &Path, value: &impl serde::Serialize) -> anyhow::Result<()> {
+    let file = File::create(path).with_context(|| format!("cannot write {}", path.display()))?;
+    let mut file = BufWriter::new(file);
+    let written = serde_json::to_writer_pretty(&mut file, value).map_err(std::io::Error::from);
+    written
+        .and_then(|()| writeln!(file))
+        .and_then(|()| file.flush())
+        .with_context(|| format!("cannot write {}", path.display()))
 }
 
 /// A bar over the bytes of the input; nothing where nobody would see it.

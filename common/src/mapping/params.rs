@@ -1,8 +1,8 @@
 use serde::{Deserialize, Serialize};
 
+use super::BaselineParams;
 use super::tuning::{MIN_BAND, Tuning};
 use crate::hand::MAX_FINGERS;
-use super::BaselineParams;
 
 /// Which mapping drives the hand.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]

@@ -259,7 +259,7 @@ impl<'a> Judge<'a> {
         let solve = |slot: usize, target: &Vector3<f64>| {
             let chain: &FingerChain = &self.hand.fingers[slot];
             let posture = chain.select(&posture);
-            let (q, report) = self.solvers[slot].solve(chain, target, &posture, &posture, POSTURE_WEIGHT_MIN);
+            let (q, report) = self.solvers[slot].solve(chain, target, &posture, None, POSTURE_WEIGHT_MIN);
             (chain.tip(&q, TipFrame::Pole), report.residual)
         };
         let Some(slot) = self.hand.fingers.iter().position(|chain| chain.finger == finger) else {

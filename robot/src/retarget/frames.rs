@@ -8,7 +8,10 @@ use std::rc::Rc;
 
 use anyhow::Context as _;
 use teleop_common::hand::HandSide;
-use teleop_common::master::{Calibration, Calibrator, Fitter, MasterGeometry, MasterPose};
+use teleop_common::master::{
+    Calibration, Calibrator, Filter, FilterSettings, Fitter, Keypoints, MasterGeometry, MasterPose,
+};
+use teleop_common::quality::HumanTips;
 use teleop_common::recording::{FrameData, LastLine, RecordingReader};
 
 use crate::usage::UsageError;
@@ -19,46 +22,92 @@ pub(super) struct Frames {
     reader: RecordingReader<Counted>,
     read: Rc<Cell<u64>>,
     geometry: MasterGeometry,
-    fitter: Option<Fitter>,
+    tracker: Option<Tracker>,
+}
+
+/// One frame.
+pub(super) struct HandFrame {
+    /// s
+    pub(super) t: f64,
+    /// What is mapped.
+    pub(super) pose: MasterPose,
+    /// What was recorded.
+    pub(super) human: HumanTips,
+    /// Bytes of the file read so far.
+    pub(super) read: u64,
+}
+
+/// Makes postures of keypoints.
+struct Tracker {
+    side: HandSide,
+    fitter: Fitter,
+    filter: Option<Filter>,
+    last: Option<f64>,
+}
+
+impl Tracker {
+    fn new(calibration: &Calibration, filtered: bool) -> Self {
+        let filter = filtered.then(|| Filter::new(calibration.geometry, FilterSettings::default()));
+        let fitter = Fitter::new(calibration.geometry, calibration.side);
+        Self { side: calibration.side, fitter, filter, last: None }
+    }
+
+    fn pose(&mut self, t: f64, keypoints: &Keypoints) -> MasterPose {
+        let mut pose = self.fitter.pose(keypoints);
+        let last = self.last.replace(t);
+        if let Some(filter) = &mut self.filter {
+            pose.q = filter.apply(t - last.unwrap_or(t), keypoints, &pose.q);
+        }
+        pose
+    }
 }
 
 impl Frames {
     /// Opens `path`. If it holds keypoints and no calibration is given, measures the hand over the whole file first.
-    pub(super) fn open(path: &Path, calibration: Option<&Path>, side: HandSide) -> anyhow::Result<Self> {
+    pub(super) fn open(
+        path: &Path,
+        calibration: Option<&Path>,
+        side: HandSide,
+        filtered: bool,
+    ) -> anyhow::Result<Self> {
         let known = calibration.map(load_calibration).transpose()?;
         let (reader, read) = read(path)?;
         let mut geometry = reader.header().geometry.unwrap_or(MasterGeometry::PARADIGMATIC);
-        let mut fitter = None;
+        let mut tracker = None;
         if let Some(known) = known {
             geometry = known.geometry;
-            fitter = Some(Fitter::new(known.geometry, known.side));
+            tracker = Some(Tracker::new(&known, filtered));
         } else if matches!(first(path)?, Some(FrameData::Keypoints(_))) {
             let measured = measure(path, side)?;
             for line in measured.report() {
                 tracing::info!("{line}");
             }
             geometry = measured.geometry;
-            fitter = Some(Fitter::new(measured.geometry, measured.side));
+            tracker = Some(Tracker::new(&measured, filtered));
         }
         if let Some(error) = geometry.validate().err() {
             return Err(UsageError(format!("{}: {error}", path.display())).into());
         }
-        Ok(Self { path: path.to_owned(), reader, read, geometry, fitter })
+        Ok(Self { path: path.to_owned(), reader, read, geometry, tracker })
     }
 }
 
 impl Iterator for Frames {
-    /// Time (s), pose, and bytes read so far.
-    type Item = anyhow::Result<(f64, MasterPose, u64)>;
+    type Item = anyhow::Result<HandFrame>;
 
     fn next(&mut self) -> Option<Self::Item> {
         let frame = match self.reader.next()? {
             Ok(frame) => frame,
             Err(error) => return Some(Err(UsageError(format!("{}: {error}", self.path.display())).into())),
         };
-        let pose = match (&frame.data, &mut self.fitter) {
-            (FrameData::Joints(q), _) => MasterPose { q: *q, geometry: self.geometry, tuning: None },
-            (FrameData::Keypoints(keypoints), Some(fitter)) => fitter.pose(keypoints),
+        let (pose, human) = match (&frame.data, &mut self.tracker) {
+            (FrameData::Joints(q), _) => {
+                let pose = MasterPose { q: *q, geometry: self.geometry, tuning: None };
+                (pose, HumanTips::of_pose(&pose))
+            }
+            (FrameData::Keypoints(keypoints), Some(tracker)) => {
+                (tracker.pose(frame.t, keypoints), HumanTips::of_keypoints(keypoints, tracker.side))
+            }
             (FrameData::Keypoints(_), None) => {
                 let (path, line) = (self.path.display(), self.reader.line());
                 let text = format!(
@@ -68,7 +117,7 @@ impl Iterator for Frames {
                 return Some(Err(UsageError(text).into()));
             }
         };
-        Some(Ok((frame.t, pose, self.read.get())))
+        Some(Ok(HandFrame { t: frame.t, pose, human, read: self.read.get() }))
     }
 }
 

@@ -210,7 +210,7 @@ impl Baseline {
                 true if out.e_c <= 1e-6 => IkStatus::Reached,
                 true => IkStatus::Unreachable,
             };
-            out.ik = IkReport { status, iterations: minimum.iterations, residual: out.e_c };
+            out.ik = IkReport { status, iterations: minimum.iterations, residual: out.e_c, jumped: false };
         }
         MappingOutput::new(q_joint, q, &signals[..hand.fingers.len()])
     }
