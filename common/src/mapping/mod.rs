@@ -14,6 +14,7 @@
 //! | [`tuning`](Tuning) | what is known about one operator |
 //! | [`tuner`](tune()) | scales and radii for one operator and one robot hand |
 //! | [`baseline`](Baseline) | the objectives of AnyTeleop and DexPilot, to compare with |
+//! | `thumb` | the thumb's joint mapping by directions |
 //! | [`retargeter`](Retargeter) | the whole step: a [`crate::master::MasterPose`] in, a [`MappingOutput`] out |
 
 mod baseline;
@@ -22,6 +23,7 @@ mod contact;
 mod gain;
 mod params;
 mod retargeter;
+mod thumb;
 mod tuner;
 mod tuning;
 
@@ -31,7 +33,7 @@ pub use baseline::{Baseline, BaselineParams, Minimum, TipObjective};
 pub use cartesian::CartesianMap;
 pub use contact::Contact;
 pub use gain::Gain;
-pub use params::{Anchor, GainShape, MappingMode, MappingParams, ParamError, Pinned, ThumbGain, TuningUse};
+pub use params::{Anchor, GainShape, MappingMode, MappingParams, ParamError, Pinned, ThumbGain, ThumbMap, TuningUse};
 pub use retargeter::Retargeter;
 pub use tuner::{Judge, Tuned, contacts, tune};
 pub use tuning::{Tuning, TuningError};

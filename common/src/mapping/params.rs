@@ -65,6 +65,19 @@ pub enum TuningUse {
     Fixed,
 }
 
+/// How the thumb's joints follow the person's thumb.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum ThumbMap {
+    /// By directions if the pose brings a [`Tuning`], as those of a person seen by a tracker do; by angles otherwise.
+    #[default]
+    Auto,
+    /// By the joint map, like the fingers.
+    Angles,
+    /// So that its phalanges point where the person's do.
+    Directions,
+}
+
 /// Which parameters were set on purpose and hold for every operator.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Pinned {
@@ -96,6 +109,8 @@ pub struct MappingParams {
     pub gain: GainShape,
     /// The thumb's gain.
     pub thumb_gain: ThumbGain,
+    /// The thumb's joint mapping.
+    pub thumb_map: ThumbMap,
     /// Whose `scale`, `r1` and `r2` hold.
     pub tuning: TuningUse,
     /// Those of the three that hold in any case.
@@ -150,6 +165,7 @@ impl Default for MappingParams {
             joint_map: "split".to_owned(),
             gain: GainShape::Cosine,
             thumb_gain: ThumbGain::Closest,
+            thumb_map: ThumbMap::Auto,
             tuning: TuningUse::Operator,
             pinned: Pinned::default(),
             baseline: BaselineParams::default(),
@@ -167,6 +183,7 @@ impl MappingParams {
             scale: 2.7,
             anchor: Anchor::Reference,
             joint_map: "role".to_owned(),
+            thumb_map: ThumbMap::Angles,
             tuning: TuningUse::Fixed,
             ..Self::default()
         }

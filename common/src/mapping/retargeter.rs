@@ -2,9 +2,9 @@ use nalgebra::Vector3;
 
 use super::{
     Anchor, Baseline, CartesianMap, FingerSignals, Gain, MappingMode, MappingOutput, MappingParams, ParamError,
-    ThumbGain,
+    ThumbGain, ThumbMap, thumb::ThumbShape,
 };
-use crate::hand::{Finger, FingerChain, HandModel, JointMap, MAX_FINGER_JOINTS, MAX_FINGERS, TipFrame};
+use crate::hand::{Finger, FingerChain, HandModel, JointMap, JointVector, MAX_FINGER_JOINTS, MAX_FINGERS, TipFrame};
 use crate::ik::{FingerIk, POSTURE_WEIGHT_MAX};
 use crate::master::MasterPose;
 
@@ -20,6 +20,7 @@ pub struct Retargeter {
     cartesian: CartesianMap,
     gain: Gain,
     solvers: Vec<FingerIk>,
+    thumb_shape: Option<ThumbShape>,
     // Last solution per finger, and of the thumb's projection.
     last: [Option<[f64; MAX_FINGER_JOINTS]>; MAX_FINGERS],
     last_anchor: Option<[f64; MAX_FINGER_JOINTS]>,
@@ -42,6 +43,7 @@ impl Retargeter {
             cartesian: CartesianMap::new(&hand, params.scale),
             gain: Gain { r1: params.r1, r2: params.r2, shape: params.gain },
             solvers: hand.fingers.iter().map(|chain| FingerIk::new(chain, &hand.joints)).collect(),
+            thumb_shape: ThumbShape::new(&hand),
             baseline: Baseline::new(&hand, params.mode, params.baseline),
             hand,
             params,
@@ -80,7 +82,7 @@ impl Retargeter {
     /// Maps one pose: all of Eq. 1-14, or one of the baselines.
     #[must_use]
     pub fn map(&mut self, pose: &MasterPose) -> MappingOutput {
-        let q_joint = self.hand.clip(&self.joint_map.apply(&pose.q));
+        let q_joint = self.joint(pose);
         let palm_from_anatomical = self.hand.anatomical_from_palm.transpose();
         let tips = Finger::ALL.map(|finger| pose.tip(finger));
         self.tune(pose);
@@ -122,6 +124,21 @@ impl Retargeter {
             chain.scatter(&own, &mut q);
         }
         MappingOutput::new(q_joint, q, &signals[..self.hand.fingers.len()])
+    }
+
+    /// Clipped M_Q(q), rad.
+    fn joint(&self, pose: &MasterPose) -> JointVector {
+        let mut q = self.hand.clip(&self.joint_map.apply(&pose.q));
+        let by_directions = match self.params.thumb_map {
+            ThumbMap::Auto => pose.tuning.is_some(),
+            ThumbMap::Angles => false,
+            ThumbMap::Directions => true,
+        };
+        let thumb = self.hand.fingers.iter().find(|chain| chain.finger == Finger::Thumb);
+        if let (true, Some(chain), Some(shape)) = (by_directions, thumb, &self.thumb_shape) {
+            chain.scatter(&shape.solve(chain, &self.hand.anatomical_from_palm.transpose(), pose), &mut q);
+        }
+        q
     }
 
     /// Takes over what the pose says about its operator.

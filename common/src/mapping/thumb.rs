@@ -1,0 +1,280 @@
+use nalgebra::{Matrix3, SMatrix, SVector, Vector3};
+
+use crate::hand::{Finger, FingerChain, HandModel, MAX_FINGER_JOINTS};
+use crate::master::MasterPose;
+
+const N: usize = MAX_FINGER_JOINTS;
+type Bones = [Vector3<f64>; 3];
+
+/// Weights of metacarpal, proximal and distal phalanx: the last two are what a person sees and touches with.
+const WEIGHTS: [f64; 3] = [0.15, 1.0, 1.0];
+/// Weight of a radian away from the rest posture: it decides what the directions leave open.
+const REST: f64 = 0.1;
+/// Steps that tell which valley is deeper.
+const LOOK: usize = 4;
+/// Steps of the descent from there.
+const ITERATIONS: usize = 20;
+/// How far apart two postures are to be in two valleys, rad.
+const APART: f64 = 0.8;
+/// Longest step of a joint, rad.
+const MAX_STEP: f64 = 0.4;
+/// A step below this (rad) ends the descent.
+const SETTLED: f64 = 1e-5;
+
+/// The joint mapping of a thumb whose human joints are not the robot's: the posture whose phalanges point where the
+/// human's do.
+///
+/// A person's thumb turns about axes that are neither the paradigmatic hand's nor the Allegro's, so angles copied from
+/// one to the other bring the thumb somewhere else: on a recorded hand its last phalanx pointed 86 deg astray. What the
+/// three have in common are three bones, so
+///
+/// ```text
+/// M_Q,T(q) = argmin  sum_b w_b^2 ||u_b(q_S) - d_b(q)||^2 + w_0^2 ||q_S - q_rest||^2     in the joint box
+/// ```
+///
+/// with unit vectors d_b (human, from the fitted posture) and u_b (robot) along metacarpal, proximal and distal
+/// phalanx. The robot's are the lines from the first joint to the last but one, from there to the last, and from there
+/// to the pole.
+#[derive(Clone, Debug)]
+pub(super) struct ThumbShape {
+    lower: SVector<f64, N>,
+    upper: SVector<f64, N>,
+    rest: SVector<f64, N>,
+    // Postures over the joint box, with their bones: where to begin.
+    seeds: Vec<(SVector<f64, N>, Bones)>,
+}
+
+impl ThumbShape {
+    /// For the thumb of `hand`; `None` if it has fewer than three joints, and so no bones to compare.
+    pub(super) fn new(hand: &HandModel) -> Option<Self> {
+        let chain = hand.fingers.iter().find(|chain| chain.finger == Finger::Thumb)?;
+        let count = chain.joints.len();
+        if count < 3 {
+            return None;
+        }
+        let own = |value: fn(&crate::hand::Joint) -> f64| {
+            let mut out = SVector::<f64, N>::zeros();
+            chain.joints.iter().enumerate().for_each(|(slot, joint)| out[slot] = value(&hand.joints[joint.joint]));
+            out
+        };
+        let (lower, upper) = (own(|joint| joint.lower), own(|joint| joint.upper));
+        let shares = [0.1, 0.5, 0.9];
+        let seeds = (0..shares.len().pow(count as u32)).map(|index| {
+            let mut rest = index;
+            let mut q = SVector::<f64, N>::zeros();
+            for slot in 0..count {
+                q[slot] = lower[slot] + (upper[slot] - lower[slot]) * shares[rest % shares.len()];
+                rest /= shares.len();
+            }
+            (q, bones(chain, &q).0)
+        });
+        Some(Self { lower, upper, rest: own(|joint| joint.home), seeds: seeds.collect() })
+    }
+
+    /// The thumb's joint angles (rad, palm outwards) for the human's pose.
+    pub(super) fn solve(
+        &self,
+        chain: &FingerChain,
+        palm_from_anatomical: &Matrix3<f64>,
+        pose: &MasterPose,
+    ) -> [f64; N] {
+        let wanted = wanted(palm_from_anatomical, pose);
+        // The two best valleys; the cost of the first few steps tells which is the deeper one.
+        let first = self.seed(&wanted, None);
+        let second = self.seed(&wanted, Some(&first));
+        let [first, second] = [first, second].map(|seed| self.descend(chain, &wanted, seed, LOOK));
+        let (_, q) = if second.0 < first.0 { second } else { first };
+        self.descend(chain, &wanted, q, ITERATIONS).1.into()
+    }
+
+    /// The best posture to begin at, away from `other`.
+    fn seed(&self, wanted: &Bones, other: Option<&SVector<f64, N>>) -> SVector<f64, N> {
+        let mut best = (f64::INFINITY, self.rest);
+        for (q, bones) in &self.seeds {
+            let cost = self.cost(wanted, bones, q);
+            if cost < best.0 && other.is_none_or(|other| (q - other).amax() > APART) {
+                best = (cost, *q);
+            }
+        }
+        best.1
+    }
+
+    /// Levenberg-Marquardt with the joints at their ends held.
+    fn descend(
+        &self,
+        chain: &FingerChain,
+        wanted: &Bones,
+        mut q: SVector<f64, N>,
+        iterations: usize,
+    ) -> (f64, SVector<f64, N>) {
+        let (mut now, mut slopes) = bones(chain, &q);
+        let mut value = self.cost(wanted, &now, &q);
+        let mut damping = 0.0;
+        for _ in 0..iterations {
+            let mut gradient = (q - self.rest) * (REST * REST);
+            let mut hessian = SMatrix::<f64, N, N>::identity() * (REST * REST + damping);
+            for bone in 0..3 {
+                let weight = WEIGHTS[bone] * WEIGHTS[bone];
+                gradient += slopes[bone].tr_mul(&(now[bone] - wanted[bone])) * weight;
+                hessian += slopes[bone].tr_mul(&slopes[bone]) * weight;
+            }
+            for slot in 0..N {
+                let held = (q[slot] <= self.lower[slot] && gradient[slot] > 0.0)
+                    || (q[slot] >= self.upper[slot] && gradient[slot] < 0.0);
+                if held {
+                    gradient[slot] = 0.0;
+                    hessian.row_mut(slot).fill(0.0);
+                    hessian.column_mut(slot).fill(0.0);
+                    hessian[(slot, slot)] = 1.0;
+                }
+            }
+            let Some(factor) = hessian.cholesky() else { break };
+            let step = factor.solve(&gradient);
+            let step = step * (MAX_STEP / step.amax().max(MAX_STEP));
+            let next = (q - step).zip_zip_map(&self.lower, &self.upper, |q, lower, upper| q.max(lower).min(upper));
+            let moved = (next - q).amax();
+            let (next_bones, next_slopes) = bones(chain, &next);
+            let next_value = self.cost(wanted, &next_bones, &next);
+            if next_value < value {
+                (q, now, slopes, value) = (next, next_bones, next_slopes, next_value);
+                damping *= 0.2;
+            } else {
+                damping = (damping * 5.0).max(1e-2);
+            }
+            if moved < SETTLED {
+                break;
+            }
+        }
+        (value, q)
+    }
+
+    fn cost(&self, wanted: &Bones, bones: &Bones, q: &SVector<f64, N>) -> f64 {
+        let shape: f64 = (0..3).map(|bone| (WEIGHTS[bone] * (bones[bone] - wanted[bone])).norm_squared()).sum();
+        shape + REST * REST * (q - self.rest).norm_squared()
+    }
+}
+
+/// Unit vectors along the human's three bones, in the palm frame.
+fn wanted(palm_from_anatomical: &Matrix3<f64>, pose: &MasterPose) -> Bones {
+    let [base, second, third, tip] = pose.geometry.finger_points(Finger::Thumb, &pose.finger(Finger::Thumb));
+    [second - base, third - second, tip - third].map(|bone| palm_from_anatomical * bone.normalize())
+}
+
+/// Unit vectors along the three bones in the palm frame, and their derivatives by the joints.
+fn bones(chain: &FingerChain, q: &SVector<f64, N>) -> (Bones, [SMatrix<f64, 3, N>; 3]) {
+    let count = chain.joints.len();
+    let (mut position, mut rotation) = (Vector3::zeros(), Matrix3::identity());
+    let (mut origins, mut axes) = ([Vector3::<f64>::zeros(); N], [Vector3::zeros(); N]);
+    for (slot, joint) in chain.joints.iter().enumerate() {
+        position += rotation * joint.translation;
+        rotation *= joint.rotation_at(q[slot]);
+        origins[slot] = position;
+        axes[slot] = rotation * joint.axis;
+    }
+    let pole = position + rotation * chain.pole;
+    let (knuckle, last) = (origins[count - 2], origins[count - 1]);
+    // A bone's ends, and how many joints move it as a whole.
+    let ends = [(origins[0], knuckle, 0), (knuckle, last, count - 1), (last, pole, count)];
+    let mut out = ([Vector3::zeros(); 3], [SMatrix::<f64, 3, N>::zeros(); 3]);
+    for (bone, (from, to, rigid)) in ends.into_iter().enumerate() {
+        let vector = to - from;
+        let length = vector.norm().max(1e-9);
+        let unit = vector / length;
+        out.0[bone] = unit;
+        for slot in 0..count {
+            let slope = if slot < rigid {
+                axes[slot].cross(&unit)
+            } else if bone == 0 && slot < count - 2 {
+                // The metacarpal has joints inside.
+                let slope = axes[slot].cross(&(to - origins[slot])) / length;
+                slope - unit * unit.dot(&slope)
+            } else {
+                continue;
+            };
+            out.1[bone].set_column(slot, &slope);
+        }
+    }
+    out
+}
+
+#[cfg(test)]
+mod tests {
+    #![allow(clippy::unwrap_used, reason = "tests")]
+
+    use super::*;
+    use crate::hand::HandSide;
+    use crate::master::{JOINT_LIMITS, MasterGeometry};
+
+    /// Uniform in 0..1, the same on every run.
+    fn random(state: &mut u64) -> f64 {
+        *state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        (*state >> 11) as f64 / (1_u64 << 53) as f64
+    }
+
+    fn random_pose(state: &mut u64) -> MasterPose {
+        let mut q = [0.0; 20];
+        // What thumbs do, and some more.
+        for (angle, range) in q.iter_mut().zip(&JOINT_LIMITS[0]) {
+            *angle = range.min - 0.3 + (range.max - range.min + 0.6) * random(state);
+        }
+        MasterPose { q, geometry: MasterGeometry::PARADIGMATIC, tuning: None }
+    }
+
+    #[test]
+    fn no_posture_found_at_random_is_better() {
+        let mut state = 7;
+        for side in [HandSide::Right, HandSide::Left] {
+            let hand = HandModel::allegro_v4(side);
+            let chain = &hand.fingers[0];
+            let shape = ThumbShape::new(&hand).unwrap();
+            let palm = hand.anatomical_from_palm.transpose();
+            let (mut worse, mut worst) = (0, 0.0_f64);
+            for _ in 0..300 {
+                let pose = random_pose(&mut state);
+                let wanted = wanted(&palm, &pose);
+                let q = SVector::from(shape.solve(chain, &palm, &pose));
+                let cost = |q: &SVector<f64, N>| shape.cost(&wanted, &bones(chain, q).0, q);
+                let found = cost(&q);
+                // A random search that narrows down.
+                let (mut best, mut best_q) = (f64::INFINITY, q);
+                for round in 0..3000 {
+                    let width = if round < 1000 { 1.0 } else { 0.2 * 0.997_f64.powi(round - 1000) };
+                    let mut other = SVector::<f64, N>::zeros();
+                    for slot in 0..4 {
+                        let (lower, upper) = (shape.lower[slot], shape.upper[slot]);
+                        let around = if round < 1000 { 0.5 * (lower + upper) } else { best_q[slot] };
+                        let drawn = around + (random(&mut state) - 0.5) * (upper - lower) * width;
+                        other[slot] = drawn.clamp(lower, upper);
+                    }
+                    let value = cost(&other);
+                    if value < best {
+                        (best, best_q) = (value, other);
+                    }
+                }
+                worse += usize::from(found > best + 1e-4);
+                worst = worst.max(found - best);
+            }
+            assert!(worse <= 6, "{worse} of 300 worse than a random search, by up to {worst}");
+        }
+    }
+
+    #[test]
+    fn small_moves_of_the_human_are_small_moves_of_the_robot() {
+        let hand = HandModel::allegro_v4(HandSide::Right);
+        let shape = ThumbShape::new(&hand).unwrap();
+        let palm = hand.anatomical_from_palm.transpose();
+        let mut state = 11;
+        let mut steps: Vec<f64> = (0..2000)
+            .map(|_| {
+                let pose = random_pose(&mut state);
+                let mut near = pose;
+                near.q[..4].iter_mut().for_each(|angle| *angle += 1e-3 * (random(&mut state) - 0.5));
+                let solve = |pose| SVector::from(shape.solve(&hand.fingers[0], &palm, pose));
+                (solve(&near) - solve(&pose)).amax()
+            })
+            .collect();
+        steps.sort_by(f64::total_cmp);
+        // Half a milliradian in. The few leaps are where two postures are equally good.
+        assert!(steps[1980] < 5e-3, "{} rad", steps[1980]);
+    }
+}
