@@ -126,7 +126,10 @@ impl Problem<'_> {
             };
             let trial = self.clip(&std::array::from_fn(|slot| q[slot] + step[slot]));
             let moved = step.iter().fold(0.0_f64, |largest, step| largest.max(step.abs()));
-            if moved < if is_newton { last_step.min(0.5 * radius) } else { 1e-9 } {
+            let next = predicted(&step);
+            // A multiplier that is still on its way bends the valley, and makes short steps.
+            let settled = is_newton && (next - multiplier).norm() < 0.01 * multiplier.norm() + self.weight;
+            if moved < if settled { last_step.min(0.5 * radius) } else { 1e-9 } {
                 let residual = self.residual(&trial);
                 let cost = self.cost(&residual, &trial);
                 // Below rounding either is as good.
@@ -144,7 +147,7 @@ impl Problem<'_> {
                 continue;
             }
             radius = if ahead.cost > state.cost { 0.5 * moved } else { (2.0 * radius).min(RADIUS) };
-            rho = Some(predicted(&step));
+            rho = Some(next);
             (q, state) = (trial, ahead);
             if state.cost < best.cost {
                 best = Optimum { q, residual: state.residual.norm(), cost: state.cost, ..best };

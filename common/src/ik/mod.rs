@@ -153,8 +153,8 @@ impl FingerIk {
         // There is a seed for every finger with joints.
         let best = best.unwrap_or_else(|| problem.descend(reference, BUDGET));
         let (taken, jumped) = match kept {
-            Some(kept) if best.cost >= cap || apart(&kept.q, &best.q) < 1e-3 => (kept, false),
-            kept => (best, kept.is_some()),
+            Some(kept) if best.cost >= cap => (kept, false),
+            kept => (best, kept.is_some_and(|kept| apart(&kept.q, &best.q) > 1e-2)),
         };
         let status = if taken.residual <= (0.05 * mu).max(1e-6) {
             IkStatus::Reached
