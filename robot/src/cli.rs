@@ -22,9 +22,9 @@ Examples:
 
 Configuration file (--config FILE), every value optional:
   preset = \"default\"          # or \"paper\"
-  [mapping]                   # mode, r1, r2 (m), scale, anchor, joint_map, gain, thumb_gain, thumb_map (auto, angles,
-                              # directions), tuning (operator or
-  r2 = 0.06                   # fixed); an r1, r2 or scale given here holds whatever the operator's tuning says;
+  [mapping]                   # mode, r1, r2 (m), scale, anchor, joint_map, gain, thumb_gain,
+  r2 = 0.06                   # thumb_map (auto, angles, directions), tuning (operator, fixed): an r1, r2 or scale
+                              # given here holds whatever the operator's tuning says;
                               # baseline = { scale, low_pass } of the modes vector and dexpilot
   [control]                   # rate_hz, hold_after_s, max_age_s, smoothing_s, engage_speed_rad_s, engage_ramp_s,
   hold_after_s = 0.2          # tip_overlap_m, velocity_scale, acceleration_scale
