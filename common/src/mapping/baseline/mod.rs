@@ -24,7 +24,7 @@
 //! 3 cm (weight 400).
 //!
 //! Differences to that library: the box is kept exactly (it allows 1e-3 rad beyond), the minimum is found to rounding
-//! and from several starts (it stops when the sum changes by less than 1e-6), and the line search sees the same sum
+//! and from two starts (it stops when the sum changes by less than 1e-6), and the line search sees the same sum
 //! as the gradient (its value lacks the temporal term).
 
 mod objective;
