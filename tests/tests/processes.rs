@@ -47,7 +47,7 @@ fn follows_another(probe: &Probe, former: u64) -> u64 {
 #[track_caller]
 fn assert_still(states: &[State]) {
     let start = states[0].tick;
-    // At most 7 rad/s, braked with 120 rad/s²: 58 ms, 20 ticks. The hand itself takes longer to settle.
+    // At most 7 rad/s, braked with 300 rad/s²: 24 ms, 8 ticks. The hand itself takes longer to settle.
     let after = |ticks: u64| states.iter().filter(move |state| state.tick >= start + ticks);
     let commands: Vec<_> = after(30).map(|state| state.q_command()).collect();
     assert!(commands.len() >= 20, "only {} states to judge by", commands.len());
