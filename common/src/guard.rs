@@ -30,6 +30,14 @@ const ITERATIONS: usize = 10;
 const MAX_HELD: usize = 3;
 /// Pairs with a gap below this are watched, m.
 const NEAR: f64 = 0.01;
+/// Sweeps over the pairs when slowing.
+const SLOW_SWEEPS: usize = 6;
+/// Room between two fingertips from which on nobody has to brake, m.
+const BRAKING: f64 = 0.06;
+/// Overlap on the way, over the allowance, m.
+const SLACK: f64 = 0.0003;
+/// How fast an overlap is undone, 1/s.
+const PUSH: f64 = 20.0;
 /// Sweeps over the pairs in each.
 const SWEEPS: usize = 8;
 /// Largest move of a joint in one linearisation, rad.
@@ -120,6 +128,73 @@ impl TipGuard {
         }
         // Where there is no way out near by, nothing is better than something worse.
         if self.deepest(hand, &x) <= self.deepest(hand, q) { x } else { *q }
+    }
+
+    /// Slows fingertips that approach each other so that they can still brake before they touch, and turns those that
+    /// overlap too much apart: the change of `velocity` (rad/s, wire order) at posture `q` that is least in the squares.
+    ///
+    /// Postures far apart may have fingertips in each other's way; this guards the way from one to the other. Each
+    /// joint stays between `low` and `high` (rad/s), which is what the joint can do in the next tick, `period` seconds;
+    /// `acceleration` (rad/s²) is what it can change each second. `movable` as in [`TipGuard::apart`].
+    pub fn slow(
+        &self,
+        hand: &HandModel,
+        q: &JointVector,
+        movable: &[bool; MAX_FINGERS],
+        velocity: &mut JointVector,
+        [low, high]: [&JointVector; 2],
+        period: f64,
+    ) {
+        let mut tips = [(Vector3::zeros(), TipJacobian::zeros()); MAX_FINGERS];
+        for (tip, chain) in tips.iter_mut().zip(&hand.fingers) {
+            *tip = chain.tip_and_jacobian(&chain.select(q)[..chain.joints.len()], TipFrame::Center);
+        }
+        for _ in 0..SLOW_SWEEPS {
+            let mut slowed = false;
+            for (a, b) in pairs(hand.fingers.len()) {
+                let between = tips[b].0 - tips[a].0;
+                let distance = between.norm();
+                let room = distance - (self.radii[a] + self.radii[b] - self.allowance - SLACK);
+                if room > BRAKING {
+                    continue;
+                }
+                let normal = between.try_normalize(1e-9).unwrap_or_else(Vector3::x);
+                let neither = !movable[a] && !movable[b];
+                let sides = || {
+                    let (tips, fingers) = (&tips, &hand.fingers);
+                    [(a, -1.0), (b, 1.0)].into_iter().flat_map(move |(finger, sign)| {
+                        let moves = movable[finger] || neither;
+                        fingers[finger].joints.iter().enumerate().map(move |(slot, joint)| {
+                            (joint.joint, sign * tips[finger].1.column(slot).dot(&normal), moves)
+                        })
+                    })
+                };
+                // Speed at which the centres part, and how much of it can be gained a second.
+                let (mut parting, mut gain, mut grip) = (0.0, 0.0, 0.0);
+                for (joint, slope, moves) in sides() {
+                    parting += slope * velocity[joint];
+                    if moves {
+                        gain += slope.abs() * hand.joints[joint].acceleration;
+                        grip += slope * slope;
+                    }
+                }
+                // Half of what the joints can do is left to what else they have to do.
+                let allowed = if room > 0.0 { -(gain * room).sqrt().min(0.5 * room / period) } else { -room * PUSH };
+                if parting >= allowed || grip < 1e-12 {
+                    continue;
+                }
+                slowed = true;
+                let share = (allowed - parting) / grip;
+                for (joint, slope, moves) in sides() {
+                    if moves {
+                        velocity[joint] = (velocity[joint] + slope * share).max(low[joint]).min(high[joint]);
+                    }
+                }
+            }
+            if !slowed {
+                break;
+            }
+        }
     }
 
     fn overlaps(&self, hand: &HandModel, q: &JointVector, mut see: impl FnMut(usize, usize, f64)) {

@@ -75,26 +75,42 @@ impl Conditioner {
 
     /// Next command towards `target` (rad), with speeds further limited to `speed` (rad/s).
     ///
-    /// A target that is not finite is ignored: the joint holds.
-    pub fn follow(&mut self, target: &JointVector, speed: f64) {
+    /// `adjust` may change the velocities that bring the hand there (rad/s); it gets the last command (rad), the
+    /// velocities, and the least and largest that the limits allow. A target that is not finite is ignored: the joint
+    /// holds.
+    pub fn follow(
+        &mut self,
+        target: &JointVector,
+        speed: f64,
+        adjust: impl FnOnce(&JointVector, &mut JointVector, [&JointVector; 2]),
+    ) {
+        let (mut wanted, mut low, mut high) = (self.position, self.position, self.position);
         for joint in 0..self.position.len() {
             let limits = self.limits[joint];
-            let wanted = target.get(joint).copied().filter(|value| value.is_finite());
-            let wanted = wanted.unwrap_or(self.position[joint]).clamp(limits.lower, limits.upper);
-            self.stages[0][joint] += (wanted - self.stages[0][joint]) * self.share;
+            let goal = target.get(joint).copied().filter(|value| value.is_finite());
+            let goal = goal.unwrap_or(self.position[joint]).clamp(limits.lower, limits.upper);
+            self.stages[0][joint] += (goal - self.stages[0][joint]) * self.share;
             self.stages[1][joint] += (self.stages[0][joint] - self.stages[1][joint]) * self.share;
             // As fast as can still be braked at the filtered target. Its own velocity is not added: that would track
             // without the lag of v / 2a, but overshoot a target that stops.
             let gap = self.stages[1][joint] - self.position[joint];
-            let closing = brakeable(gap.abs(), limits.acceleration, self.period).copysign(gap);
-            self.advance(joint, closing, speed);
+            (low[joint], high[joint]) = self.range(joint, speed);
+            wanted[joint] =
+                within(brakeable(gap.abs(), limits.acceleration, self.period).copysign(gap), low[joint], high[joint]);
+        }
+        adjust(&self.position, &mut wanted, [&low, &high]);
+        for joint in 0..self.position.len() {
+            // Whatever came back, a number or none.
+            let next = if wanted[joint].is_finite() { wanted[joint] } else { 0.0 };
+            self.advance(joint, within(next, low[joint], high[joint]));
         }
     }
 
     /// Next command of a stop: brakes as fast as allowed, then stands still.
     pub fn hold(&mut self) {
         for joint in 0..self.position.len() {
-            self.advance(joint, 0.0, f64::INFINITY);
+            let (low, high) = self.range(joint, f64::INFINITY);
+            self.advance(joint, within(0.0, low, high));
         }
         self.reset_filter();
     }
@@ -105,23 +121,30 @@ impl Conditioner {
         self.velocity.iter().all(|velocity| *velocity == 0.0)
     }
 
-    fn advance(&mut self, joint: usize, wanted: f64, speed: f64) {
+    /// Least and largest velocity of the next tick.
+    fn range(&self, joint: usize, speed: f64) -> (f64, f64) {
         let limits = self.limits[joint];
         let (position, velocity) = (self.position[joint], self.velocity[joint]);
         let change = limits.acceleration * self.period;
         // A lower speed limit is reached by braking, never by a jump.
         let speed = speed.max(velocity.abs() - change).min(limits.velocity);
+        let (low, high) = ((velocity - change).max(-speed), (velocity + change).min(speed));
+        // Last, because it is never in conflict with the acceleration: every earlier step kept the way to brake.
         let to_lower = -brakeable(position - limits.lower, limits.acceleration, self.period);
         let to_upper = brakeable(limits.upper - position, limits.acceleration, self.period);
-        let next = wanted
-            .clamp(-speed, speed)
-            .clamp(velocity - change, velocity + change)
-            // Last, because it is never in conflict with the acceleration: every earlier step kept the way to brake.
-            .max(to_lower)
-            .min(to_upper);
-        self.velocity[joint] = next;
-        self.position[joint] = (position + next * self.period).clamp(limits.lower, limits.upper);
+        (within(low, to_lower, to_upper), within(high, to_lower, to_upper))
     }
+
+    fn advance(&mut self, joint: usize, velocity: f64) {
+        let limits = self.limits[joint];
+        self.velocity[joint] = velocity;
+        self.position[joint] = (self.position[joint] + velocity * self.period).clamp(limits.lower, limits.upper);
+    }
+}
+
+/// `value` between `low` and `high`; the last wins, should rounding have crossed them.
+fn within(value: f64, low: f64, high: f64) -> f64 {
+    value.max(low).min(high)
 }
 
 /// Largest velocity for one tick from which a joint can still stop within `distance` (m or rad), braking by
@@ -175,7 +198,7 @@ mod tests {
             for (target, ticks, speed, hold) in targets {
                 let target = JointVector::from_slice(&target);
                 for _ in 0..ticks {
-                    if hold { conditioner.hold() } else { conditioner.follow(&target, speed) }
+                    if hold { conditioner.hold() } else { conditioner.follow(&target, speed, |_, _, _| {}) }
                     let (next, velocity) = (*conditioner.position(), *conditioner.velocity());
                     for (joint, limits) in hand.joints.iter().enumerate() {
                         prop_assert!(next[joint] >= limits.lower && next[joint] <= limits.upper);
@@ -197,7 +220,7 @@ mod tests {
             let mut conditioner = Conditioner::new(&hand, &hand.home(), PERIOD, 0.01);
             let start = *conditioner.position();
             for _ in 0..1000 {
-                conditioner.follow(&target, f64::INFINITY);
+                conditioner.follow(&target, f64::INFINITY, |_, _, _| {});
                 for joint in 0..16 {
                     let way = (target[joint] - start[joint]).signum();
                     prop_assert!((target[joint] - conditioner.position()[joint]) * way >= -1e-9);
@@ -218,7 +241,7 @@ mod tests {
         for tick in 0..1000 {
             let phase = f64::from(tick) * PERIOD * 4.0;
             target[1] = hand.home()[1] + 0.5 * (1.0 - phase.cos());
-            conditioner.follow(&target, f64::INFINITY);
+            conditioner.follow(&target, f64::INFINITY, |_, _, _| {});
             let speed = 2.0;
             let lag = speed * speed / (2.0 * acceleration) + 2.0 * speed * PERIOD;
             assert!((conditioner.position()[1] - target[1]).abs() < lag, "at {phase}");
@@ -232,7 +255,7 @@ mod tests {
         let mut target = hand.home();
         target[2] = 1.6;
         for _ in 0..30 {
-            conditioner.follow(&target, f64::INFINITY);
+            conditioner.follow(&target, f64::INFINITY, |_, _, _| {});
         }
         let (from, velocity) = (conditioner.position()[2], conditioner.velocity()[2]);
         assert!(velocity > 1.0);

@@ -107,8 +107,9 @@ pub struct Controller {
     engaged_at: MonoTime,
     sample: Option<PoseSample>,
     mapping: Option<MappingOutput>,
-    // Its posture with the fingertips apart.
+    // Its posture with the fingertips apart, and the fingers that may give way for that.
     target: JointVector,
+    movable: [bool; MAX_FINGERS],
     // The last valid state of the hand.
     state: JointState,
     tick: u64,
@@ -134,6 +135,7 @@ impl Controller {
             sample: None,
             mapping: None,
             target: state.q,
+            movable: [false; MAX_FINGERS],
             state,
             tick: 0,
             holds: 0,
@@ -212,9 +214,9 @@ impl Controller {
             if known != Some((sample.epoch, sample.sequence)) {
                 let mapping = retargeter.map(&sample.pose);
                 // A finger that only copies the human's shape keeps it: the others go round it.
-                let mut movable = [false; MAX_FINGERS];
-                movable.iter_mut().zip(mapping.fingers()).for_each(|(own, signals)| *own = signals.k > 0.0);
-                self.target = self.guard.apart(retargeter.hand(), &mapping.q, &movable);
+                self.movable = [false; MAX_FINGERS];
+                self.movable.iter_mut().zip(mapping.fingers()).for_each(|(own, signals)| *own = signals.k > 0.0);
+                self.target = self.guard.apart(retargeter.hand(), &mapping.q, &self.movable);
                 self.mapping = Some(mapping);
                 self.sample = Some(*sample);
             }
@@ -232,7 +234,10 @@ impl Controller {
                 // The limit widens tenfold over the ramp, then only the joints' own limits count.
                 let ramp = since < params.engage_ramp;
                 let widened = params.engage_speed * (1.0 + 9.0 * since / params.engage_ramp);
-                conditioner.follow(&self.target, if ramp { widened } else { f64::INFINITY });
+                let (guard, hand, movable) = (&self.guard, retargeter.hand(), &self.movable);
+                conditioner.follow(&self.target, if ramp { widened } else { f64::INFINITY }, |q, velocity, range| {
+                    guard.slow(hand, q, movable, velocity, range, 1.0 / params.rate);
+                });
             }
             _ => conditioner.hold(),
         }
