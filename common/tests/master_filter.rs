@@ -167,7 +167,7 @@ fn every_pinch_of_the_recording_is_kept() {
         assert!(pinches > 30, "{pinches}");
         let (raw, smooth) = (jitter(&raw), jitter(&smooth));
         println!("{}: {pinches} pinches, second difference {:.1} to {:.1} mrad", side.name(), raw * 1e3, smooth * 1e3);
-        assert!(smooth < 0.4 * raw, "{raw} to {smooth}");
+        assert!(smooth < 0.3 * raw, "{raw} to {smooth}");
     }
 }
 
