@@ -21,9 +21,11 @@ use super::{Angles, N};
 use crate::hand::FingerChain;
 
 /// Angles of the held joint that are always tried.
-const NODES: usize = 24;
+const NODES: usize = 37;
+/// Every how manieth of them is tried with a start; the last one has to be among them.
+const WARM_STRIDE: usize = 3;
 /// Most angles that are tried besides.
-const EVENTS: usize = 16;
+const EVENTS: usize = 17;
 /// Most seeds.
 pub(super) const SEEDS: usize = 5;
 
@@ -90,6 +92,8 @@ pub(super) struct Scan {
     lengths: [f64; 2],
     // beta of the stretched arm.
     straight: f64,
+    // Range of the cosine of the elbow's bend, forwards and backwards, in which beta can be inside its limits.
+    bends: [(f64, f64); 2],
     // Angle of the held joint and its e^i at every node.
     nodes: [(f64, Plane); NODES],
     alpha_ends: [Plane; 2],
@@ -174,12 +178,14 @@ struct Pass<'a> {
     wish: [f64; 4],
     weight: f64,
     cap: f64,
+    // Whether to look for the ends of valleys.
+    ends: bool,
     // Whether postures count that do not reach the target.
     near: bool,
 }
 
 impl Pass<'_> {
-    fn valleys(&self, nodes: &Nodes<'_>) -> [Seed; SEEDS] {
+    fn valleys(&mut self, nodes: &Nodes<'_>) -> [Seed; SEEDS] {
         let mut valleys = Valleys { found: [Seed::NONE; SEEDS], last: [Seed::NONE; 2], falling: [true; 2] };
         let mut last: Option<(Plane, [Seed; 2])> = None;
         for &(angle, turn) in &nodes.list[..nodes.count] {
@@ -190,7 +196,7 @@ impl Pass<'_> {
                 continue;
             }
             let seeds = self.at(angle, turn);
-            if let Some(last) = last {
+            if let Some(last) = last.filter(|_| self.ends) {
                 for side in [0, 1] {
                     if seeds[side].reached != last.1[side].reached {
                         let ends = if seeds[side].reached { [(turn, seeds), last] } else { [last, (turn, seeds)] };
@@ -200,6 +206,10 @@ impl Pass<'_> {
             }
             valleys.push(seeds);
             last = Some((turn, seeds));
+            // What costs more than the best of all, and could not be less between two nodes, is of no use.
+            if valleys.found[0].reached {
+                self.cap = self.cap.min(valleys.found[0].cost + 2.0 * FLOOR_MARGIN * self.weight);
+            }
         }
         valleys.push([Seed::NONE; 2]);
         valleys.found
@@ -212,12 +222,15 @@ impl Pass<'_> {
         if reach > 0.0 && 0.5 * reach * reach >= self.cap {
             return Seed::NONE;
         }
-        for _ in 0..6 {
-            let middle = inside + outside;
+        // A stop of the sweep at an event is such an end already: look close by first.
+        for share in [0.1, 0.5, 0.5, 0.5, 0.5] {
+            let middle = inside * (1.0 - share) + outside * share;
             let middle = middle / middle.norm_sqr().sqrt();
             let found = self.at(self.scan.sweep.clip(atan2_of(middle)).0, middle)[side];
             if found.reached {
                 (seed, inside) = (found, middle);
+            } else if share < 0.5 {
+                break;
             } else {
                 outside = middle;
             }
@@ -242,6 +255,8 @@ impl Pass<'_> {
             }
             let offset = beside + self.weight * ((roll - self.wish[0]).powi(2) + (angle - self.wish[1]).powi(2));
             if 0.5 * offset >= self.cap {
+                // Too dear is not out of reach.
+                best.iter_mut().for_each(|seed| seed.reached = true);
                 continue;
             }
             scan.arm((Plane::new(at.x, radius) - shoulder) * back, self.near, |side, alpha, beta, miss| {
@@ -285,6 +300,18 @@ impl Valleys {
 
 /// How far the posture can move between two nodes, rad, roughly.
 const NODE_MARGIN: f64 = 0.2;
+/// How much less the square of that distance can be between two nodes than at a node that has less than its neighbours,
+/// rad², roughly.
+pub(super) const FLOOR_MARGIN: f64 = 0.03;
+
+/// What is known from a descent before.
+#[derive(Clone, Copy)]
+pub(super) struct Start {
+    /// Only what costs less than this is of interest, m².
+    pub(super) cap: f64,
+    /// The target has been reached.
+    pub(super) reached: bool,
+}
 
 /// A posture to descend from.
 #[derive(Clone, Copy)]
@@ -346,7 +373,7 @@ impl Scan {
         });
         let alpha_ends = [alpha.lower, alpha.upper].map(|angle| Plane::from_polar(1.0, angle));
         // The ends of beta's range, and where the arm is straight or folded.
-        let straight = links[0].arg() - links[1].arg();
+        let straight = (links[0] * links[1].conj()).arg();
         let stiff = [(beta.lower, true), (beta.upper, true), beta.clip(straight), beta.clip(straight + PI)]
             .into_iter()
             .filter(|(_, inside)| *inside)
@@ -368,6 +395,11 @@ impl Scan {
             links,
             lengths: links.map(|link| link.norm()),
             straight,
+            bends: [1.0, -1.0].map(|side| {
+                // Whole turns aside, as the ranges of joints are.
+                let ends = [beta.lower, beta.upper].map(|end| (side * (end - straight)).clamp(0.0, PI).cos());
+                (ends[0].min(ends[1]) - TOLERANCE, ends[0].max(ends[1]) + TOLERANCE)
+            }),
             nodes,
             alpha_ends,
             roll_ends: [roll.lower, roll.upper].map(f64::sin_cos),
@@ -375,20 +407,33 @@ impl Scan {
         })
     }
 
-    /// Where a descent can find an optimum that costs less than `cap` (m²), the best first, with infinite cost where
+    /// Where a descent can find an optimum, the best first, with infinite cost where
     /// there are fewer: the postures that cost less than their neighbours along the sweep, and the ends of valleys, with
-    /// the elbow bent forwards and backwards. If none of them reaches the target, postures that come near.
-    pub(super) fn run(&self, target: &Vector3<f64>, reference: &Angles, weight: f64, cap: f64) -> [Seed; SEEDS] {
+    /// the elbow bent forwards and backwards. If none of them reaches the target, postures that come
+    /// near. With a start the sweep is coarser and leaves the exact ends of valleys out: it comes again with the next
+    /// target.
+    pub(super) fn run(
+        &self,
+        target: &Vector3<f64>,
+        reference: &Angles,
+        weight: f64,
+        start: Option<Start>,
+    ) -> [Seed; SEEDS] {
         let wish = [&self.roll, &self.sweep, &self.alpha, &self.beta].map(|role| role.sense * reference[role.slot]);
         let way = Way::new(self, target);
-        let mut nodes = Nodes { sweep: &self.sweep, list: [(0.0, Plane::new(0.0, 0.0)); NODES + EVENTS], count: NODES };
-        nodes.list[..NODES].copy_from_slice(&self.nodes);
+        let mut nodes = Nodes { sweep: &self.sweep, list: [(0.0, Plane::new(0.0, 0.0)); NODES + EVENTS], count: 0 };
+        for node in self.nodes.iter().step_by(if start.is_some() { WARM_STRIDE } else { 1 }) {
+            nodes.list[nodes.count] = *node;
+            nodes.count += 1;
+        }
         let (angle, _) = self.sweep.clip(wish[1]);
         nodes.add(angle, Plane::from_polar(1.0, angle));
         self.events(&way, &mut nodes);
-        let mut pass = Pass { scan: self, rolls: self.rolls(&way.fixed), way, wish, weight, cap, near: false };
+        let cap = start.map_or(f64::INFINITY, |start| start.cap);
+        let ends = start.is_none();
+        let mut pass = Pass { scan: self, rolls: self.rolls(&way.fixed), way, wish, weight, cap, ends, near: false };
         let mut found = pass.valleys(&nodes);
-        if found[0].cost == f64::INFINITY {
+        if start.is_none_or(|start| !start.reached) && found[0].cost == f64::INFINITY {
             pass.near = true;
             found = pass.valleys(&nodes);
         }
@@ -453,12 +498,13 @@ impl Scan {
         let square = way.norm_sqr();
         let cos = (square - a * a - b * b) / (2.0 * a * b);
         let mut reached = false;
-        if cos.abs() <= 1.0 + 1e-9 {
+        let possible = self.bends.map(|(low, high)| cos >= low && cos <= high);
+        if cos.abs() <= 1.0 + 1e-9 && (possible[0] || possible[1]) {
             let sin = (1.0 - cos * cos).max(0.0).sqrt();
             let bend = atan2(sin, cos);
             for (index, side) in [1.0, -1.0].into_iter().enumerate() {
                 let (beta, inside) = self.beta.clip(self.straight + side * bend);
-                if inside {
+                if inside && possible[index] {
                     // e^i(beta) second = first / |first| * |second| * e^i(side bend)
                     let arm = first * Plane::new(a + b * cos, side * b * sin);
                     let (alpha, inside) = self.alpha.clip(atan2_of(way * arm.conj()));
@@ -508,12 +554,10 @@ fn atan2(y: f64, x: f64) -> f64 {
     let (small, large) = (x.abs().min(y.abs()), x.abs().max(y.abs()));
     let ratio = small / large.max(f64::MIN_POSITIVE);
     let square = ratio * ratio;
-    let mut angle = ((-0.046_496_474_9 * square + 0.159_314_22) * square - 0.327_622_764) * square * ratio + ratio;
-    if y.abs() > x.abs() {
-        angle = FRAC_PI_2 - angle;
-    }
-    if x < 0.0 {
-        angle = PI - angle;
-    }
-    if y < 0.0 { -angle } else { angle }
+    let angle = ((-0.046_496_474_9 * square + 0.159_314_22) * square - 0.327_622_764) * square * ratio + ratio;
+    // Without branches: the octants of a sweep are hard to predict.
+    let steep = f64::from(u8::from(y.abs() > x.abs()));
+    let angle = steep * FRAC_PI_2 + (1.0 - 2.0 * steep) * angle;
+    let behind = f64::from(u8::from(x < 0.0));
+    (behind * PI + (1.0 - 2.0 * behind) * angle).copysign(y)
 }
