@@ -11,6 +11,7 @@
 //! | [`mapping`] | the combined joint-Cartesian mapping, Eq. 1-14 |
 //! | [`guard`] | keeps the fingertips out of each other |
 //! | [`ik`] | bounded lexicographic inverse kinematics of one finger |
+//! | [`paper`] | the paper's tables and figures as numbers |
 //! | [`mode`] | what the robot is doing |
 //! | [`key`] | key expressions of a robot |
 //! | [`wire`] | the binary messages and their one codec door |
@@ -28,6 +29,7 @@ pub mod master;
 pub mod mode;
 #[cfg(feature = "net")]
 pub mod net;
+pub mod paper;
 pub mod quality;
 pub mod recording;
 pub mod testing;

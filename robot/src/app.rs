@@ -33,11 +33,13 @@ pub fn main(cli: Cli) -> ExitCode {
     let log = match &command {
         Command::Run(args) => &args.log,
         Command::Retarget(args) => &args.log,
+        Command::Paper(args) => &args.log,
         Command::Viewer(args) => &args.log,
     };
     let result = start_logging(log).and_then(|()| match command {
         Command::Run(args) => run(&args),
         Command::Retarget(args) => crate::retarget::run(&args),
+        Command::Paper(args) => crate::paper::run(&args),
         Command::Viewer(args) => view(&args),
     });
     match result {

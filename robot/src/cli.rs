@@ -18,6 +18,7 @@ Examples:
   robot --preset paper --mode cartesian     the paper's parameters, Cartesian mapping only
   robot --viewer connect=192.168.0.5        show in the viewer of another machine
   robot retarget --input hand.csv --output joints.jsonl
+  robot paper --out paper                   the paper's tables and figures: open paper/index.html
   robot viewer --bind 0.0.0.0               only the viewer, for other processes to connect to
 
 Configuration file (--config FILE), every value optional:
@@ -30,6 +31,23 @@ Configuration file (--config FILE), every value optional:
   hold_after_s = 0.2          # tip_overlap_m, velocity_scale, acceleration_scale
 
 Exit codes: 0 done (also after Ctrl-C), 1 failed while running, 2 wrong usage or configuration.";
+
+const PAPER: &str = "\
+Writes into DIR (made if missing; files of the same names are replaced):
+  index.html                  everything on one page: open this
+  summary.json                what was checked: P1 to P7 of Fig. 8, the claims of Fig. 6, per preset
+  table1.json                 Table 1: phalanx lengths, c_s, d
+  fig2.json fig2.csv          Fig. 2: errors of plain Cartesian and joint mapping, 455 fingers
+  fig4.csv                    Fig. 4: the gain, corrected and as printed
+  fig6.json fig6.csv          Fig. 6: taps under joint, Cartesian and combined mapping
+  fig8_PRESET.csv             Fig. 8: the tripod, 80 s; ..._close.csv with the fingers more curled
+  smoothness.json, .csv       speed, velocity jumps and jerk, before and after the loop
+  fig*.svg smoothness.svg     the plots; fig7_PRESET.svg are frames of fig8_PRESET
+  paper.rrd                   Fig. 2 and 8 to turn and play: rerun DIR/paper.rrd
+
+Examples:
+  robot paper --out paper
+  robot paper --out left --hand left --preset default";
 
 /// Drives a robot hand with the poses of a human hand.
 #[derive(Debug, Parser)]
@@ -51,6 +69,9 @@ pub enum Command {
     Run(RunArgs),
     /// Map a whole recording to joint angles, as fast as possible
     Retarget(RetargetArgs),
+    /// Compute the paper's tables and figures: numbers, plots, one page that shows them all
+    #[command(after_help = PAPER)]
+    Paper(PaperArgs),
     /// Host the viewer for other processes (--viewer connect=HOST) and nothing else
     Viewer(ViewerArgs),
 }
@@ -175,6 +196,23 @@ pub struct RetargetArgs {
     pub log: LogArgs,
 }
 
+/// Options of `robot paper`.
+#[derive(Args, Clone, Debug)]
+pub struct PaperArgs {
+    /// Folder to write to
+    #[arg(long, value_name = "DIR")]
+    pub out: PathBuf,
+    /// Which Allegro Hand
+    #[arg(long, value_enum, default_value = "right")]
+    pub hand: Side,
+    /// Parameters of the mapping, paper or default; repeatable
+    #[arg(long, value_name = "NAME", default_values = ["paper", "default"])]
+    pub preset: Vec<String>,
+    /// Logging.
+    #[command(flatten)]
+    pub log: LogArgs,
+}
+
 /// Options of `robot viewer`.
 #[derive(Args, Clone, Debug)]
 pub struct ViewerArgs {
@@ -195,6 +233,23 @@ pub enum Switch {
     Off,
 }
 
+impl Side {
+    const fn model(self) -> HandSide {
+        match self {
+            Self::Right => HandSide::Right,
+            Self::Left => HandSide::Left,
+        }
+    }
+}
+
+impl PaperArgs {
+    /// Where the hand comes from.
+    #[must_use]
+    pub fn source(&self) -> HandSource {
+        HandSource { side: self.hand.model(), urdf: None, description: None }
+    }
+}
+
 impl HandArgs {
     /// What overrides the configuration file.
     #[must_use]
@@ -212,11 +267,7 @@ impl HandArgs {
     /// Where the hand comes from.
     #[must_use]
     pub fn source(&self) -> HandSource {
-        let side = match self.hand {
-            Side::Right => HandSide::Right,
-            Side::Left => HandSide::Left,
-        };
-        HandSource { side, urdf: self.urdf.clone(), description: self.description.clone() }
+        HandSource { side: self.hand.model(), urdf: self.urdf.clone(), description: self.description.clone() }
     }
 }
 

@@ -8,6 +8,7 @@
 //! | [`receive`] | poses from the network into the slot of the control loop |
 //! | [`telemetry`] | state, mapping and health to the network and the viewer |
 //! | [`retarget`] | whole recordings offline |
+//! | [`paper`] | the paper's tables and figures |
 //! | [`config`] | configuration, checked |
 //! | [`cli`], [`app`] | command line; wiring and shutdown |
 //! | [`usage`] | what is wrong usage, for the exit code |
@@ -17,6 +18,7 @@ pub mod cli;
 pub mod config;
 pub mod control;
 pub mod driver;
+pub mod paper;
 pub mod receive;
 pub mod retarget;
 pub mod runtime;

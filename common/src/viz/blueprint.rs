@@ -25,20 +25,32 @@ const WINDOW: i64 = 20_000_000_000;
 /// its own and stays with it. A layout that a person has arranged stays too: this one becomes the default, and active
 /// only where there is no other.
 pub(super) fn send(sink: &dyn LogSink) -> RecordingStreamResult<()> {
-    let messages = messages()?;
+    send_layout(sink, &Layout { root: layout(), timeline: TIMELINE, play: PlayState::Following })
+}
+
+/// What a viewer shows first.
+pub(super) struct Layout {
+    pub(super) root: Node,
+    pub(super) timeline: &'static str,
+    pub(super) play: PlayState,
+}
+
+/// Sends a layout as [`send`] does.
+pub(super) fn send_layout(sink: &dyn LogSink, layout: &Layout) -> RecordingStreamResult<()> {
+    let messages = messages(layout)?;
     if let Some(id) = messages.first().map(|message| message.store_id().clone()) {
         sink.send_blueprint(messages, BlueprintActivationCommand::make_default(id));
     }
     Ok(())
 }
 
-fn messages() -> RecordingStreamResult<Vec<LogMsg>> {
+fn messages(layout: &Layout) -> RecordingStreamResult<Vec<LogMsg>> {
     let (stream, storage) =
         RecordingStreamBuilder::new(APPLICATION).recording_id("layout").blueprint().enabled(true).memory()?;
     stream.set_log_time_enabled(false);
     stream.set_time_sequence("blueprint", 0);
     let mut ids = 0;
-    let root = write(&layout(), &mut ids, &stream)?;
+    let root = write(&layout.root, &mut ids, &stream)?;
     let viewport = ViewportBlueprint::new()
         .with_root_container(RootContainer(Uuid { bytes: uuid_bytes(root.id) }))
         .with_auto_layout(false)
@@ -49,8 +61,8 @@ fn messages() -> RecordingStreamResult<Vec<LogMsg>> {
     stream.log("selection_panel", &collapsed)?;
     let time = TimePanelBlueprint::new()
         .with_state(PanelState::Collapsed)
-        .with_timeline(TIMELINE)
-        .with_play_state(PlayState::Following);
+        .with_timeline(layout.timeline)
+        .with_play_state(layout.play);
     stream.log("time_panel", &time)?;
     Ok(storage.take())
 }
@@ -92,15 +104,23 @@ fn layout() -> Node {
 }
 
 /// A container with the share of each child, or a view.
-enum Node {
+pub(super) enum Node {
     Row(Vec<(f32, Self)>),
     Column(Vec<(f32, Self)>),
     /// Children and the one in front.
     Tabs(Vec<Self>, usize),
     View(View),
+    /// A container with a name of its own, for a tab.
+    Titled(String, Box<Self>),
 }
 
-struct View {
+impl Node {
+    pub(super) fn titled(self, title: &str) -> Self {
+        Self::Titled(title.to_owned(), Box::new(self))
+    }
+}
+
+pub(super) struct View {
     class: &'static str,
     name: String,
     origin: String,
@@ -115,9 +135,9 @@ impl View {
     }
 }
 
-struct Eye {
-    target: [f32; 3],
-    distance: f32,
+pub(super) struct Eye {
+    pub(super) target: [f32; 3],
+    pub(super) distance: f32,
 }
 
 fn bare(class: &'static str, name: &str, origin: &str, contents: &[&str]) -> View {
@@ -125,12 +145,13 @@ fn bare(class: &'static str, name: &str, origin: &str, contents: &[&str]) -> Vie
     View { class, name: name.to_owned(), origin: origin.to_owned(), contents, properties: Vec::new() }
 }
 
-fn view(class: &'static str, name: &str, origin: &str, contents: &[&str]) -> Node {
+/// A view with the viewer's own settings.
+pub(super) fn view(class: &'static str, name: &str, origin: &str, contents: &[&str]) -> Node {
     Node::View(bare(class, name, origin, contents))
 }
 
 /// A 3D view on a hand, from the front, a little from the thumb's side and from above.
-fn space(name: &str, root: &str, eye: Eye) -> Node {
+pub(super) fn space(name: &str, root: &str, eye: Eye) -> Node {
     // A unit vector towards the eye.
     const FROM: [f32; 3] = [0.42, 0.18, 0.889];
     let position: [f32; 3] = std::array::from_fn(|i| eye.target[i] + FROM[i] * eye.distance);
@@ -157,6 +178,14 @@ fn plot(name: &str, contents: &[&str], range: Option<[f64; 2]>) -> Node {
         Some(range) => view.with("ScalarAxis", &ScalarAxis::new().with_range(range)),
         None => view,
     })
+}
+
+/// A plot from 0 to `end`, ns.
+pub(super) fn whole_plot(name: &str, contents: &str, end: i64) -> Node {
+    let [start, end] = [0, end].map(|time| TimeRangeBoundary::Absolute(TimeInt(time)));
+    let legend = PlotLegend::new().with_corner(Corner2D::LeftTop);
+    let view = bare("TimeSeries", name, "/", &[contents]).with("PlotLegend", &legend);
+    Node::View(view.with("TimeAxis", &TimeAxis::new().with_view_range(TimeRange { start, end })))
 }
 
 fn windowed(view: View) -> View {
@@ -225,6 +254,12 @@ fn write(node: &Node, ids: &mut u64, stream: &RecordingStream) -> RecordingStrea
         Node::Tabs(children, front) => {
             let written = children.iter().map(|child| write(child, ids, stream)).collect::<RecordingStreamResult<_>>();
             container(ContainerKind::Tabs, written?, Vec::new(), Some(*front))
+        }
+        Node::Titled(title, node) => {
+            let written = write(node, ids, stream)?;
+            stream
+                .log(written.path.as_str(), &ContainerBlueprint::update_fields().with_display_name(title.as_str()))?;
+            Ok(written)
         }
         Node::View(view) => {
             let path = format!("/view/{}", uuid_text(id));

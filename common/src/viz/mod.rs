@@ -17,12 +17,14 @@
 //! | `queue` | bounded, drops the oldest, counts |
 //! | `scene` | frames to Rerun's archetypes |
 //! | `blueprint` | the layout of the first view |
+//! | `paper` | the paper's figures as a recording |
 
 mod blueprint;
 mod frame;
 mod hub;
 mod link;
 mod palette;
+mod paper;
 mod queue;
 mod scene;
 mod status;
@@ -33,6 +35,8 @@ use std::time::Duration;
 
 pub use frame::{Level, OperatorFrame, RobotFrame};
 pub use hub::{GRPC_PORT, Hub, HubError, HubOptions, PAGE_PORT};
+pub use palette::{finger_rgb, heat};
+pub use paper::{PaperCloud, PaperRun, save_paper};
 pub use scene::Scene;
 pub use status::Status;
 pub use viewer::{Viewer, ViewerError};

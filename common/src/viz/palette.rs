@@ -25,13 +25,30 @@ pub(super) const fn rgba(r: u8, g: u8, b: u8, a: u8) -> Color {
 }
 
 pub(super) const fn finger(finger: Finger) -> Color {
+    let [r, g, b] = finger_rgb(finger);
+    rgb(r, g, b)
+}
+
+/// The finger's colour everywhere, made for a dark background: red, green, blue.
+#[must_use]
+pub const fn finger_rgb(finger: Finger) -> [u8; 3] {
     match finger {
-        Finger::Thumb => rgb(240, 170, 40),
-        Finger::Index => rgb(86, 180, 233),
-        Finger::Middle => rgb(40, 200, 140),
-        Finger::Ring => rgb(220, 130, 180),
-        Finger::Little => rgb(225, 215, 80),
+        Finger::Thumb => [240, 170, 40],
+        Finger::Index => [86, 180, 233],
+        Finger::Middle => [40, 200, 140],
+        Finger::Ring => [220, 130, 180],
+        Finger::Little => [225, 215, 80],
     }
+}
+
+/// A magnitude between 0 and 1: violet over green to yellow, equally bright steps. Red, green, blue.
+#[must_use]
+pub fn heat(share: f64) -> [u8; 3] {
+    const STOPS: [[f64; 3]; 5] =
+        [[68.0, 1.0, 84.0], [59.0, 82.0, 139.0], [33.0, 145.0, 140.0], [94.0, 201.0, 98.0], [253.0, 231.0, 37.0]];
+    let at = share.clamp(0.0, 1.0) * (STOPS.len() - 1) as f64;
+    let below = (at as usize).min(STOPS.len() - 2);
+    std::array::from_fn(|i| (STOPS[below][i] + (STOPS[below + 1][i] - STOPS[below][i]) * (at - below as f64)) as u8)
 }
 
 /// The joint `slot` of a finger, palm outwards.

@@ -3,7 +3,7 @@
 mod operator;
 mod robot;
 mod series;
-mod space;
+pub(super) mod space;
 
 use rerun::{RecordingStream, RecordingStreamResult, StateChange, TextLog};
 

@@ -7,7 +7,7 @@ use rerun::Quaternion;
 use crate::hand::{HandModel, HandSide};
 
 /// A human point from O_W into the view. O_W is radial-distal-palmar for either hand, so a left hand is mirrored here.
-pub(super) fn from_master(point: &Vector3<f64>, side: HandSide) -> Vector3<f64> {
+pub(in crate::viz) fn from_master(point: &Vector3<f64>, side: HandSide) -> Vector3<f64> {
     match side {
         HandSide::Right => *point,
         HandSide::Left => Vector3::new(-point.x, point.y, point.z),
@@ -31,7 +31,7 @@ pub(super) fn along(direction: &Vector3<f64>) -> UnitQuaternion<f64> {
         .unwrap_or_else(|| UnitQuaternion::from_axis_angle(&Vector3::x_axis(), std::f64::consts::PI))
 }
 
-pub(super) fn point(v: &Vector3<f64>) -> [f32; 3] {
+pub(in crate::viz) fn point(v: &Vector3<f64>) -> [f32; 3] {
     [v.x as f32, v.y as f32, v.z as f32]
 }
 
