@@ -178,7 +178,7 @@ fn broken_description_is_refused_by_name() {
         ("kp = [\n  1.0", "kp = [\n  0.0", "joints.kp: 0 for joint 'joint_0.0' must be finite and above 0"),
         ("kd = [\n  0.05", "kd = [\n  -1.0", "joints.kd: -1 for joint 'joint_0.0' must be finite and not negative"),
         ("torque = [\n  0.23", "torque = [\n  inf", "joints.torque: inf for joint 'joint_0.0'"),
-        ("acceleration = [\n  120.0", "acceleration = [\n  nan", "joints.acceleration: NaN for joint 'joint_0.0'"),
+        ("acceleration = [\n  300.0", "acceleration = [\n  nan", "joints.acceleration: NaN for joint 'joint_0.0'"),
         (
             "home = [\n  0.0",
             "home = [\n  0.5",

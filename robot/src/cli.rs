@@ -167,12 +167,15 @@ pub struct RunArgs {
 /// Options of `robot retarget`.
 #[derive(Args, Clone, Debug)]
 pub struct RetargetArgs {
-    /// Recording: JSON lines with `q` or `keypoints`, or CSV of keypoints
-    #[arg(long, value_name = "FILE")]
-    pub input: PathBuf,
-    /// Where to write, JSON lines, one per frame; appears only when complete
-    #[arg(long, value_name = "FILE")]
+    /// Recordings: JSON lines with `q` or `keypoints`, or CSV of keypoints; of a folder all .jsonl and .csv files
+    #[arg(long, value_name = "FILE|DIR", num_args = 1.., required = true)]
+    pub input: Vec<PathBuf>,
+    /// Where to write, JSON lines, one per frame; a folder for several recordings. Appears only when complete
+    #[arg(long, value_name = "FILE|DIR")]
     pub output: PathBuf,
+    /// Recordings mapped at a time [default: one per core]
+    #[arg(long, value_name = "N", value_parser = threads)]
+    pub threads: Option<usize>,
     /// Hand and mapping.
     #[command(flatten)]
     pub hand: HandArgs,
@@ -222,6 +225,13 @@ pub struct ViewerArgs {
     /// Logging.
     #[command(flatten)]
     pub log: LogArgs,
+}
+
+fn threads(text: &str) -> Result<usize, String> {
+    match text.parse() {
+        Ok(count @ 1..=1024) => Ok(count),
+        _ => Err("must be a number from 1 to 1024".to_owned()),
+    }
 }
 
 /// On or off.

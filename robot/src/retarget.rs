@@ -1,5 +1,6 @@
-//! Offline mapping of whole recordings: `robot retarget`.
+//! Offline mapping of recordings and whole data sets: `robot retarget`.
 
+mod batch;
 mod frames;
 mod output;
 
@@ -16,6 +17,7 @@ use teleop_common::master::MasterPose;
 use teleop_common::quality::{Quality, Sample};
 use teleop_common::time::MonoTime;
 
+use self::batch::Job;
 use self::frames::{Frames, HandFrame};
 use self::output::{Partial, Row};
 use crate::cli::{RetargetArgs, Switch};
@@ -27,38 +29,90 @@ use crate::usage::UsageError;
 /// After this long without a frame the hand stands still, whatever it did before.
 const SETTLED: Duration = Duration::from_secs(3);
 
-/// Maps the recording frame by frame.
+/// Maps recordings, frame by frame, as many at a time as there are threads.
 ///
 /// # Errors
 /// Input that cannot be used (with its line), or a file that cannot be written. The output file then does not appear.
+/// Of several recordings the others are still mapped.
 pub fn run(args: &RetargetArgs) -> anyhow::Result<()> {
     let config = Config::load(args.hand.config.as_deref(), &args.hand.overrides())?;
     let hand = args.hand.source().load(&config)?;
+    // Wrong parameters are told before anything is read.
+    Retargeter::new(hand.clone(), config.mapping.clone()).map_err(ConfigError::from)?;
+    let jobs = batch::jobs(&args.input, &args.output)?;
+    if args.quality.is_some() && jobs.len() > 1 {
+        let text = format!("--quality measures one recording; --input names {}", jobs.len());
+        return Err(UsageError(text).into());
+    }
+    let cores = || std::thread::available_parallelism().map_or(1, std::num::NonZero::get);
+    let threads = args.threads.unwrap_or_else(cores).min(jobs.len());
+    let started = Instant::now();
+    let bar = progress(&jobs);
+    let results = batch::each(&jobs, threads, |job| {
+        let result = one(job, args, &config, &hand, &bar);
+        if let (Err(error), true) = (&result, jobs.len() > 1) {
+            tracing::error!("{}: {error:#}", job.input.display());
+        }
+        result
+    });
+    bar.finish_and_clear();
+    let elapsed = started.elapsed().as_secs_f64();
+    let mut stats = Stats::default();
+    let (mut failed, mut first) = (0, None);
+    for result in results {
+        match result {
+            Ok(own) => stats.steps.extend(own.steps),
+            Err(error) => {
+                failed += 1;
+                first.get_or_insert(error);
+            }
+        }
+    }
+    match first {
+        Some(error) if jobs.len() == 1 => return Err(error),
+        Some(error) => return Err(error.context(format!("{failed} of {} recordings failed", jobs.len()))),
+        None => {}
+    }
+    tracing::info!(
+        "{} frames to {} in {elapsed:.2} s, {:.0} frames/s on {threads} thread{}; mapping {} per frame (median)",
+        stats.steps.len(),
+        args.output.display(),
+        stats.steps.len() as f64 / elapsed,
+        if threads == 1 { "" } else { "s" },
+        stats.quantile(0.5).map_or_else(|| "none".to_owned(), |us| format!("{us:.1} us")),
+    );
+    if let Some(path) = &args.stats {
+        write_json(path, &stats.summary(threads, elapsed))?;
+    }
+    Ok(())
+}
+
+/// Maps one recording.
+fn one(job: &Job, args: &RetargetArgs, config: &Config, hand: &HandModel, bar: &ProgressBar) -> anyhow::Result<Stats> {
     let mut retargeter = Retargeter::new(hand.clone(), config.mapping.clone()).map_err(ConfigError::from)?;
     let mut live = match args.conditioning {
-        Switch::On => Some(Live::new(&hand, &config)?),
+        Switch::On => Some(Live::new(hand, config)?),
         Switch::Off => None,
     };
-    let started = Instant::now();
     let filtered = args.filter == Switch::On;
-    let frames = Frames::open(&args.input, args.calibration.as_deref(), &hand, &config.mapping, filtered)?;
-    let mut output = Partial::create(&args.output)?;
+    let frames = Frames::open(&job.input, args.calibration.as_deref(), hand, &config.mapping, filtered)?;
+    let mut output = Partial::create(&job.output)?;
     let mut samples = args.quality.is_some().then(Vec::new);
-    let bar = progress(&args.input);
     let mut stats = Stats::default();
 
     // Writes a frame's row; with conditioning, after the live loop ran until `next`.
     let mut finish = |frame: &HandFrame, mut mapping: MappingOutput, next: f64| {
         if let Some(live) = &mut live {
-            mapping = live.run(frame.t, &frame.pose, next, &hand, &mapping);
+            mapping = live.run(frame.t, &frame.pose, next, hand, &mapping);
         }
         if let Some(samples) = &mut samples {
-            samples.push(Sample::new(&hand, frame.t, frame.human, &mapping));
+            samples.push(Sample::new(hand, frame.t, frame.human, &mapping));
         }
         output.write(&Row::new(frame.t, &frame.pose, &mapping))
     };
     // One frame behind: what the live robot commands for a frame is known when the next one comes.
     let mut waiting: Option<(HandFrame, MappingOutput)> = None;
+    let (mut period, mut done) = (0.0, 0);
     for frame in frames {
         let frame = frame?;
         let begun = Instant::now();
@@ -67,33 +121,23 @@ pub fn run(args: &RetargetArgs) -> anyhow::Result<()> {
         let (t, read) = (frame.t, frame.read);
         if let Some((before, mapping)) = waiting.replace((frame, mapped)) {
             finish(&before, mapping, t)?;
-            stats.period = t - before.t;
+            period = t - before.t;
         }
-        bar.set_position(read);
+        bar.inc(read - done);
+        done = read;
     }
     if let Some((last, mapping)) = waiting {
-        finish(&last, mapping, last.t + stats.period)?;
+        finish(&last, mapping, last.t + period)?;
     }
     output.complete()?;
-    bar.finish_and_clear();
-    tracing::info!(
-        "{} frames to {} in {:.2} s; mapping {} per frame (median)",
-        stats.steps.len(),
-        args.output.display(),
-        started.elapsed().as_secs_f64(),
-        stats.quantile(0.5).map_or_else(|| "none".to_owned(), |us| format!("{us:.1} us")),
-    );
-    if let Some(path) = &args.stats {
-        stats.write(path)?;
-    }
     if let (Some(path), Some(samples)) = (&args.quality, samples) {
-        let Some(quality) = Quality::measure(&hand, &samples) else {
-            let text = format!("{}: too short to measure --quality: it needs 3 frames", args.input.display());
+        let Some(quality) = Quality::measure(hand, &samples) else {
+            let text = format!("{}: too short to measure --quality: it needs 3 frames", job.input.display());
             return Err(UsageError(text).into());
         };
         write_json(path, &quality)?;
     }
-    Ok(())
+    Ok(stats)
 }
 
 /// The live robot in virtual time, with a hand that does exactly what it is told.
@@ -190,7 +234,6 @@ fn commanded(hand: &HandModel, mapping: &MappingOutput, q: &JointVector) -> Mapp
 struct Stats {
     // ns
     steps: Vec<u32>,
-    period: f64,
 }
 
 impl Stats {
@@ -206,14 +249,15 @@ impl Stats {
         Some(f64::from(*sorted.select_nth_unstable(rank.min(last)).1) * 1e-3)
     }
 
-    fn write(&self, path: &Path) -> anyhow::Result<()> {
-        let seconds = self.steps.iter().map(|&step| f64::from(step) * 1e-9).sum::<f64>();
-        let text = serde_json::json!({
+    fn summary(&self, threads: usize, elapsed: f64) -> serde_json::Value {
+        serde_json::json!({
             "frames": self.steps.len(),
-            "seconds": seconds,
+            "seconds": self.steps.iter().map(|&step| f64::from(step) * 1e-9).sum::<f64>(),
             "step_us": { "p50": self.quantile(0.5), "p99": self.quantile(0.99), "max": self.quantile(1.0) },
-        });
-        write_json(path, &text)
+            "threads": threads,
+            "elapsed_seconds": elapsed,
+            "frames_per_second": self.steps.len() as f64 / elapsed,
+        })
     }
 }
 
@@ -227,10 +271,10 @@ fn write_json(path: &Path, value: &impl serde::Serialize) -> anyhow::Result<()> 
         .with_context(|| format!("cannot write {}", path.display()))
 }
 
-/// A bar over the bytes of the input; nothing where nobody would see it.
-fn progress(input: &Path) -> ProgressBar {
-    let bytes = std::fs::metadata(input).map_or(0, |meta| meta.len());
-    let bar = ProgressBar::new(bytes);
+/// A bar over the bytes of the inputs; nothing where nobody would see it.
+fn progress(jobs: &[Job]) -> ProgressBar {
+    let bytes = |job: &Job| std::fs::metadata(&job.input).map_or(0, |meta| meta.len());
+    let bar = ProgressBar::new(jobs.iter().map(bytes).sum());
     if let Ok(style) =
         ProgressStyle::with_template("retarget {wide_bar} {percent:>3} % {binary_bytes_per_sec}  {eta} left")
     {
