@@ -438,6 +438,46 @@ fn posture(row: &Value) -> Vec<f64> {
 }
 
 #[test]
+fn a_data_set_is_mapped_on_all_threads() {
+    let folder = tempfile::tempdir().unwrap();
+    let (input, output) = (folder.path().join("set"), folder.path().join("mapped"));
+    std::fs::create_dir(&input).unwrap();
+    let gestures = [Gesture::Wave, Gesture::Fist, Gesture::Tripod, Gesture::Count];
+    for gesture in gestures {
+        std::fs::write(input.join(format!("{gesture}.jsonl")), lines(&motion(gesture, 1.0))).unwrap();
+    }
+    std::fs::write(input.join("notes.txt"), "no recording").unwrap();
+    let (input, output) = (input.to_str().unwrap(), output.to_str().unwrap());
+    let stats = folder.path().join("stats.json");
+    let base = ["retarget", "--input", input, "--output", output, "--threads", "3"];
+    let done = run("robot", &[&base[..], &["--stats", stats.to_str().unwrap()]].concat());
+    assert!(done.status.success(), "{}", String::from_utf8_lossy(&done.stderr));
+    let mut frames = 0;
+    for gesture in gestures {
+        let own = Job::new(lines(&motion(gesture, 1.0))).rows(&["--threads", "1"]);
+        frames += own.len();
+        assert_eq!(read(&Path::new(output).join(format!("{gesture}.jsonl"))), own, "{gesture}");
+    }
+    let stats: Value = serde_json::from_slice(&std::fs::read(stats).unwrap()).unwrap();
+    assert_eq!((&stats["frames"], &stats["threads"]), (&frames.into(), &3.into()));
+    assert!(stats["frames_per_second"].as_f64().unwrap() > 0.0);
+
+    // One that is bad does not keep the others from being mapped.
+    std::fs::remove_dir_all(output).unwrap();
+    std::fs::write(Path::new(input).join("bad.jsonl"), "{\"t\": 0}\n").unwrap();
+    let failed = run("robot", &base);
+    let text = String::from_utf8_lossy(&failed.stderr);
+    assert_eq!(failed.status.code(), Some(2), "{text}");
+    assert!(text.contains("bad.jsonl") && text.contains("1 of 5 recordings failed"), "{text}");
+    assert_eq!(std::fs::read_dir(output).unwrap().count(), gestures.len());
+
+    std::fs::write(Path::new(input).join("fist.csv"), "").unwrap();
+    let failed = run("robot", &base);
+    let text = String::from_utf8_lossy(&failed.stderr);
+    assert!(failed.status.code() == Some(2) && text.contains("would both be written to"), "{text}");
+}
+
+#[test]
 fn a_long_gap_is_passed_at_once() {
     let mut motion = motion(Gesture::Wave, 1.0);
     for (t, _) in &mut motion[50..] {
