@@ -16,7 +16,7 @@
 
 use nalgebra::{SMatrix, SVector, Vector3};
 
-use crate::hand::{HandModel, Joint, JointVector, MAX_FINGER_JOINTS, MAX_FINGERS, MAX_JOINTS, TipFrame, TipJacobian};
+use crate::hand::{HandModel, Joint, JointVector, MAX_FINGERS, MAX_JOINTS, TipFrame, TipJacobian};
 
 const MAX_PAIRS: usize = MAX_FINGERS * (MAX_FINGERS - 1) / 2;
 
@@ -56,7 +56,7 @@ pub struct TipGuard {
 }
 
 /// Points of a fingertip and their derivatives by the finger's own joints.
-#[derive(Clone, Copy)]
+#[derive(Clone, Copy, Default)]
 struct Tip {
     center: Vector3<f64>,
     center_jacobian: TipJacobian,
@@ -88,9 +88,7 @@ impl TipGuard {
     /// The deepest overlap of any two fingertips at `q`, m; negative if all are apart.
     #[must_use]
     pub fn deepest(&self, hand: &HandModel, q: &JointVector) -> f64 {
-        let mut deepest = f64::NEG_INFINITY;
-        self.overlaps(hand, q, |_, _, overlap| deepest = deepest.max(overlap));
-        deepest
+        self.deepest_of(hand.fingers.len(), &centers(hand, q))
     }
 
     /// The posture nearest to `q` (rad, wire order, inside the joint box) whose fingertips are apart.
@@ -99,19 +97,24 @@ impl TipGuard {
     /// itself, bit for bit, if there is nothing to do. Does not allocate; bounded work.
     #[must_use]
     pub fn apart(&self, hand: &HandModel, q: &JointVector, movable: &[bool; MAX_FINGERS]) -> JointVector {
+        let count = hand.fingers.len();
         let mut state = Involved::default();
-        self.involve(hand, q, movable, &mut state);
+        let before = centers(hand, q);
+        self.involve(count, &before, movable, &mut state);
         if !state.fingers.contains(&true) {
             return *q;
         }
-        let wanted = tips(hand, q);
-        let mut x = *q;
+        let mut wanted = Tips::default();
+        update(hand, q, &[true; MAX_FINGERS], &mut wanted);
+        let (mut x, mut now) = (*q, wanted);
         for _ in 0..ITERATIONS {
-            // Two fingers, nearly always.
-            let step = if state.fingers.iter().filter(|&&own| own).count() <= 2 {
-                self.step::<{ 2 * MAX_FINGER_JOINTS }>(hand, q, &x, &wanted, &state)
-            } else {
-                self.step::<MAX_JOINTS>(hand, q, &x, &wanted, &state)
+            let own = hand.fingers.iter().zip(&state.fingers).filter(|(_, own)| **own);
+            // Two fingers of four joints, nearly always.
+            let step = match own.map(|(chain, _)| chain.joints.len()).sum::<usize>() {
+                0..=8 => self.step::<8>(hand, q, &x, &wanted, &now, &state),
+                9..=12 => self.step::<12>(hand, q, &x, &wanted, &now, &state),
+                13..=16 => self.step::<16>(hand, q, &x, &wanted, &now, &state),
+                _ => self.step::<MAX_JOINTS>(hand, q, &x, &wanted, &now, &state),
             };
             let shorten = MAX_STEP / step.iter().fold(MAX_STEP, |most, own| most.max(own.abs()));
             let mut moved = 0.0_f64;
@@ -120,14 +123,16 @@ impl TipGuard {
                 moved = moved.max((next - x[index]).abs());
                 x[index] = next;
             }
+            // Nobody else has moved.
+            update(hand, &x, &state.fingers, &mut now);
             // The way out may lead into another finger.
-            let apart = !self.involve(hand, &x, movable, &mut state);
+            let apart = !self.involve(count, &now.map(|tip| tip.center), movable, &mut state);
             if moved < SETTLED && apart {
                 break;
             }
         }
         // Where there is no way out near by, nothing is better than something worse.
-        if self.deepest(hand, &x) <= self.deepest(hand, q) { x } else { *q }
+        if self.deepest_of(count, &now.map(|tip| tip.center)) <= self.deepest_of(count, &before) { x } else { *q }
     }
 
     /// Slows fingertips that approach each other so that they can still brake before they touch, and turns those that
@@ -197,28 +202,26 @@ impl TipGuard {
         }
     }
 
-    fn overlaps(&self, hand: &HandModel, q: &JointVector, mut see: impl FnMut(usize, usize, f64)) {
-        let mut centers = [Vector3::zeros(); MAX_FINGERS];
-        for (center, chain) in centers.iter_mut().zip(&hand.fingers) {
-            *center = chain.tip(&chain.select(q)[..chain.joints.len()], TipFrame::Center);
-        }
-        for (a, b) in pairs(hand.fingers.len()) {
-            see(a, b, self.radii[a] + self.radii[b] - (centers[b] - centers[a]).norm());
-        }
+    fn deepest_of(&self, count: usize, centers: &Centers) -> f64 {
+        pairs(count).map(|(a, b)| self.overlap(centers, a, b)).fold(f64::NEG_INFINITY, f64::max)
     }
 
-    /// Notes who has to give way at `q`; true if anybody overlaps.
-    fn involve(&self, hand: &HandModel, q: &JointVector, movable: &[bool; MAX_FINGERS], out: &mut Involved) -> bool {
+    fn overlap(&self, centers: &Centers, a: usize, b: usize) -> f64 {
+        self.radii[a] + self.radii[b] - (centers[b] - centers[a]).norm()
+    }
+
+    /// Notes who has to give way; true if anybody overlaps.
+    fn involve(&self, count: usize, centers: &Centers, movable: &[bool; MAX_FINGERS], out: &mut Involved) -> bool {
         let mut any = false;
-        self.overlaps(hand, q, |a, b, overlap| {
-            if overlap > self.allowance + TOLERANCE {
+        for (a, b) in pairs(count) {
+            if self.overlap(centers, a, b) > self.allowance + TOLERANCE {
                 any = true;
                 let neither = !movable[a] && !movable[b];
                 out.fingers[a] |= movable[a] || neither;
                 out.fingers[b] |= movable[b] || neither;
                 out.pairs[a][b] = true;
             }
-        });
+        }
         any
     }
 
@@ -231,9 +234,9 @@ impl TipGuard {
         q: &JointVector,
         x: &JointVector,
         wanted: &Tips,
+        now: &Tips,
         state: &Involved,
     ) -> JointVector {
-        let now = tips(hand, x);
         let count = hand.fingers.len();
         // Where each finger's joints are among the N variables, and which joint a variable is.
         let (mut first, mut joints, mut used) = ([None; MAX_FINGERS], [0; N], 0);
@@ -344,17 +347,24 @@ struct Involved {
 
 type Tips = [Tip; MAX_FINGERS];
 
-fn tips(hand: &HandModel, q: &JointVector) -> Tips {
-    let zero = (Vector3::zeros(), TipJacobian::zeros());
-    let none = Tip { center: zero.0, center_jacobian: zero.1, pole: zero.0, pole_jacobian: zero.1 };
-    let mut out = [none; MAX_FINGERS];
-    for (tip, chain) in out.iter_mut().zip(&hand.fingers) {
+type Centers = [Vector3<f64>; MAX_FINGERS];
+
+fn centers(hand: &HandModel, q: &JointVector) -> Centers {
+    let mut out = [Vector3::zeros(); MAX_FINGERS];
+    for (center, chain) in out.iter_mut().zip(&hand.fingers) {
+        *center = chain.tip(&chain.select(q)[..chain.joints.len()], TipFrame::Center);
+    }
+    out
+}
+
+/// Computes the tips of `fingers` anew.
+fn update(hand: &HandModel, q: &JointVector, fingers: &[bool; MAX_FINGERS], out: &mut Tips) {
+    for ((tip, chain), _) in out.iter_mut().zip(&hand.fingers).zip(fingers).filter(|(_, own)| **own) {
         let own = chain.select(q);
         let own = &own[..chain.joints.len()];
         (tip.center, tip.center_jacobian) = chain.tip_and_jacobian(own, TipFrame::Center);
         (tip.pole, tip.pole_jacobian) = chain.tip_and_jacobian(own, TipFrame::Pole);
     }
-    out
 }
 
 /// All pairs of `count` fingers.

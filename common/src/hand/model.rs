@@ -63,6 +63,7 @@ impl ChainJoint {
 
     /// Rotation of the link behind this joint at angle `q` (rad), in the frame of the previous moving link.
     #[must_use]
+    #[inline]
     pub fn rotation_at(&self, q: f64) -> Matrix3<f64> {
         let (sin, cos) = q.sin_cos();
         self.rotation + self.k1 * sin + self.k2 * (1.0 - cos)
@@ -105,20 +106,38 @@ impl FingerChain {
     /// Position of the tip in the palm frame (m) and its linear Jacobian.
     #[must_use]
     pub fn tip_and_jacobian(&self, q: &[f64], frame: TipFrame) -> (Vector3<f64>, TipJacobian) {
-        let (tip, jacobian, _) = self.differential(q, frame);
+        // A number of joints that the compiler knows unrolls the loops, and that of the fingers we know is four.
+        if let Ok(q) = <&[f64; 4]>::try_from(&q[..self.joints.len().min(q.len())]) {
+            self.columns(q, frame)
+        } else {
+            self.columns(
+                &std::array::from_fn::<_, MAX_FINGER_JOINTS, _>(|slot| q.get(slot).copied().unwrap_or(0.0)),
+                frame,
+            )
+        }
+    }
+
+    fn columns<const C: usize>(&self, q: &[f64; C], frame: TipFrame) -> (Vector3<f64>, TipJacobian) {
+        let (tip, columns, _) = self.differential(q, frame);
+        let mut jacobian = TipJacobian::zeros();
+        for (slot, column) in columns.iter().enumerate() {
+            jacobian.set_column(slot, column);
+        }
         (tip, jacobian)
     }
 
-    /// Tip, Jacobian and the joint axes (unit vectors), all in the palm frame.
-    pub(crate) fn differential(
+    /// Tip, columns of the Jacobian, and the joint axes (unit vectors), all in the palm frame; zero for angles beyond
+    /// the finger's joints.
+    #[inline]
+    pub(crate) fn differential<const C: usize>(
         &self,
-        q: &[f64],
+        q: &[f64; C],
         frame: TipFrame,
-    ) -> (Vector3<f64>, TipJacobian, [Vector3<f64>; MAX_FINGER_JOINTS]) {
+    ) -> (Vector3<f64>, [Vector3<f64>; C], [Vector3<f64>; C]) {
         let mut position = Vector3::zeros();
         let mut rotation = Matrix3::identity();
-        let mut origins = [Vector3::zeros(); MAX_FINGER_JOINTS];
-        let mut axes = [Vector3::zeros(); MAX_FINGER_JOINTS];
+        let mut origins = [Vector3::zeros(); C];
+        let mut axes = [Vector3::zeros(); C];
         for (slot, (joint, &angle)) in self.joints.iter().zip(q).enumerate() {
             position += rotation * joint.translation;
             rotation *= joint.rotation_at(angle);
@@ -127,11 +146,7 @@ impl FingerChain {
             axes[slot] = rotation * joint.axis;
         }
         let tip = position + rotation * self.offset(frame);
-        let mut jacobian = TipJacobian::zeros();
-        for slot in 0..self.joints.len() {
-            jacobian.set_column(slot, &axes[slot].cross(&(tip - origins[slot])));
-        }
-        (tip, jacobian, axes)
+        (tip, std::array::from_fn(|slot| axes[slot].cross(&(tip - origins[slot]))), axes)
     }
 
     /// The finger's own joint angles out of the whole hand's `q`, palm outwards.

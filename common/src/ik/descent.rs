@@ -41,38 +41,42 @@ pub(super) struct Optimum {
     pub(super) converged: bool,
 }
 
-type Square = [[f64; N]; N];
+/// The same for the C joints of a finger.
+type Row<const C: usize> = [f64; C];
+type Square<const C: usize> = [[f64; C]; C];
 
-struct State {
+struct State<const C: usize> {
     residual: Vector3<f64>,
-    jacobian: [Vector3<f64>; N],
-    axes: [Vector3<f64>; N],
+    jacobian: [Vector3<f64>; C],
+    axes: [Vector3<f64>; C],
     cost: f64,
 }
 
 impl Problem<'_> {
-    pub(super) fn cost(&self, residual: &Vector3<f64>, q: &Angles) -> f64 {
+    fn cost<const C: usize>(&self, residual: &Vector3<f64>, q: &Row<C>) -> f64 {
         let posture: f64 = q.iter().zip(&self.reference).map(|(a, b)| (a - b).powi(2)).sum();
         0.5 * (residual.norm_squared() + self.weight * posture)
     }
 
-    fn residual(&self, q: &Angles) -> Vector3<f64> {
-        self.chain.tip(&q[..self.chain.joints.len()], TipFrame::Pole) - self.target
-    }
-
-    fn state(&self, q: &Angles) -> State {
-        let (tip, jacobian, axes) = self.chain.differential(&q[..self.chain.joints.len()], TipFrame::Pole);
+    fn state<const C: usize>(&self, q: &Row<C>) -> State<C> {
+        let (tip, jacobian, axes) = self.chain.differential(q, TipFrame::Pole);
         let residual = tip - self.target;
-        State {
-            residual,
-            jacobian: std::array::from_fn(|slot| jacobian.column(slot).into()),
-            axes,
-            cost: self.cost(&residual, q),
-        }
+        State { residual, jacobian, axes, cost: self.cost(&residual, q) }
     }
 
-    pub(super) fn clip(&self, q: &Angles) -> Angles {
+    fn clip<const C: usize>(&self, q: Row<C>) -> Row<C> {
         std::array::from_fn(|slot| q[slot].max(self.lower[slot]).min(self.upper[slot]))
+    }
+
+    /// [`Self::descend_by`] the number of the chain's joints: known to the compiler, it unrolls the loops over them.
+    pub(super) fn descend(&self, start: &Angles, budget: u16) -> Optimum {
+        match self.chain.joints.len() {
+            1 => self.descend_by::<1>(start, budget),
+            2 => self.descend_by::<2>(start, budget),
+            3 => self.descend_by::<3>(start, budget),
+            4 => self.descend_by::<4>(start, budget),
+            _ => self.descend_by::<N>(start, budget),
+        }
     }
 
     /// Follows the valley down from `start`, for at most `budget` iterations.
@@ -81,60 +85,59 @@ impl Problem<'_> {
     /// the Hessian, `sum residual_i d2F_i`, is garbage off its floor. So the multiplier is kept apart from the
     /// residual, as in an augmented Lagrangian: `rho`, the residual that the last step predicted for its end. The
     /// speed of convergence is then the same for every mu.
-    pub(super) fn descend(&self, start: &Angles, budget: u16) -> Optimum {
-        let count = self.chain.joints.len();
-        let mut q = self.clip(start);
+    fn descend_by<const C: usize>(&self, start: &Angles, budget: u16) -> Optimum {
+        let all = |q: &Row<C>| std::array::from_fn(|slot| if slot < C { q[slot] } else { start[slot] });
+        let mut q: Row<C> = self.clip(std::array::from_fn(|slot| start[slot]));
         let mut state = self.state(&q);
         let mut best =
-            Optimum { q, residual: state.residual.norm(), cost: state.cost, iterations: 0, converged: false };
+            Optimum { q: all(&q), residual: state.residual.norm(), cost: state.cost, iterations: 0, converged: false };
         let last_step = (LAST_STEP * self.weight.sqrt()).sqrt().min(MAX_LAST_STEP);
         let (mut radius, mut rise) = (RADIUS, RISE);
         let mut rho: Option<Vector3<f64>> = None;
-        let mut active = [false; N];
+        let mut active = [false; C];
         for iteration in 1..=budget {
-            let gradient: Angles = std::array::from_fn(|slot| {
+            let gradient: Row<C> = std::array::from_fn(|slot| {
                 state.jacobian[slot].dot(&state.residual) + self.weight * (q[slot] - self.reference[slot])
             });
-            let low: Angles = std::array::from_fn(|slot| (self.lower[slot] - q[slot]).max(-radius));
-            let high: Angles = std::array::from_fn(|slot| (self.upper[slot] - q[slot]).min(radius));
-            let mut gauss = [[0.0; N]; N];
-            for row in 0..count {
+            let low: Row<C> = std::array::from_fn(|slot| (self.lower[slot] - q[slot]).max(-radius));
+            let high: Row<C> = std::array::from_fn(|slot| (self.upper[slot] - q[slot]).min(radius));
+            let mut gauss = [[0.0; C]; C];
+            for row in 0..C {
                 for column in 0..=row {
                     gauss[row][column] = state.jacobian[row].dot(&state.jacobian[column]);
                 }
                 gauss[row][row] += self.weight;
             }
             let predicted =
-                |step: &Angles| (0..count).fold(state.residual, |sum, slot| sum + state.jacobian[slot] * step[slot]);
+                |step: &Row<C>| (0..C).fold(state.residual, |sum, slot| sum + state.jacobian[slot] * step[slot]);
             let multiplier = rho.unwrap_or_else(|| {
-                box_step(count, &gauss, &gradient, &low, &high, &mut active)
-                    .map_or(state.residual, |step| predicted(&step))
+                box_step(&gauss, &gradient, &low, &high, &mut active).map_or(state.residual, |step| predicted(&step))
             });
             let mut newton = gauss;
-            for (row, own) in newton.iter_mut().enumerate().take(count) {
+            for (row, own) in newton.iter_mut().enumerate() {
                 // d2F / dq_row dq_column = axis_column x J_row for column <= row.
                 let lever = state.jacobian[row].cross(&multiplier);
                 for column in 0..=row {
                     own[column] += state.axes[column].dot(&lever);
                 }
             }
-            let exact = box_step(count, &newton, &gradient, &low, &high, &mut active);
+            let exact = box_step(&newton, &gradient, &low, &high, &mut active);
             let is_newton = exact.is_some();
             // The Gauss-Newton matrix is positive definite whatever comes.
-            let Some(step) = exact.or_else(|| box_step(count, &gauss, &gradient, &low, &high, &mut active)) else {
+            let Some(step) = exact.or_else(|| box_step(&gauss, &gradient, &low, &high, &mut active)) else {
                 break;
             };
-            let trial = self.clip(&std::array::from_fn(|slot| q[slot] + step[slot]));
+            let trial = self.clip(std::array::from_fn(|slot| q[slot] + step[slot]));
             let moved = step.iter().fold(0.0_f64, |largest, step| largest.max(step.abs()));
             let next = predicted(&step);
             // A multiplier that is still on its way bends the valley, and makes short steps.
             let settled = is_newton && (next - multiplier).norm() < 0.01 * multiplier.norm() + self.weight;
             if moved < if settled { last_step.min(0.5 * radius) } else { 1e-9 } {
-                let residual = self.residual(&trial);
+                let residual = self.chain.tip(&trial, TipFrame::Pole) - self.target;
                 let cost = self.cost(&residual, &trial);
                 // Below rounding either is as good.
                 if cost <= best.cost * (1.0 + 1e-9) {
-                    best = Optimum { q: trial, residual: residual.norm(), cost, ..best };
+                    best = Optimum { q: all(&trial), residual: residual.norm(), cost, ..best };
                 }
                 return Optimum { iterations: iteration, converged: true, ..best };
             }
@@ -150,7 +153,7 @@ impl Problem<'_> {
             rho = Some(next);
             (q, state) = (trial, ahead);
             if state.cost < best.cost {
-                best = Optimum { q, residual: state.residual.norm(), cost: state.cost, ..best };
+                best = Optimum { q: all(&q), residual: state.residual.norm(), cost: state.cost, ..best };
             }
         }
         Optimum { iterations: budget, ..best }
@@ -160,28 +163,27 @@ impl Problem<'_> {
 /// `argmin g'd + 1/2 d'Hd` for `low <= d <= high` by an active-set method; `active` is the guess of the joints that end
 /// on a bound, and becomes the set found. `None` if `hessian` (its lower triangle is read) is not positive definite on
 /// the free joints.
-fn box_step(
-    count: usize,
-    hessian: &Square,
-    gradient: &Angles,
-    low: &Angles,
-    high: &Angles,
-    active: &mut [bool; N],
-) -> Option<Angles> {
+fn box_step<const C: usize>(
+    hessian: &Square<C>,
+    gradient: &Row<C>,
+    low: &Row<C>,
+    high: &Row<C>,
+    active: &mut [bool; C],
+) -> Option<Row<C>> {
     let entry = |row: usize, column: usize| if row >= column { hessian[row][column] } else { hessian[column][row] };
-    let mut step = [0.0; N];
-    for slot in 0..count {
+    let mut step = [0.0; C];
+    for slot in 0..C {
         if active[slot] {
             step[slot] = if gradient[slot] > 0.0 { low[slot] } else { high[slot] };
         }
     }
     // Every pass fixes a joint or frees one; a cycle, which rounding can make, ends with the last feasible step.
-    for _ in 0..4 * N {
-        let free = solve_free(count, hessian, gradient, &step, active)?;
+    for _ in 0..4 * C {
+        let free = solve_free(hessian, gradient, &step, active)?;
         // As far towards it as the bounds allow: the first joint to hit one stays there.
         let mut hit = None;
         let mut share = 1.0;
-        for slot in 0..count {
+        for slot in 0..C {
             if active[slot] {
                 continue;
             }
@@ -198,7 +200,7 @@ fn box_step(
                 (hit, share) = (Some((slot, bound)), part);
             }
         }
-        for slot in 0..count {
+        for slot in 0..C {
             if !active[slot] {
                 step[slot] += share * (free[slot] - step[slot]);
             }
@@ -211,9 +213,9 @@ fn box_step(
         // Free the joint that its bound holds back against the slope the most.
         let mut release = None;
         let mut steepest = 0.0;
-        for slot in 0..count {
+        for slot in 0..C {
             if active[slot] && low[slot] < high[slot] {
-                let slope = (0..count).fold(gradient[slot], |sum, other| sum + entry(slot, other) * step[other]);
+                let slope = (0..C).fold(gradient[slot], |sum, other| sum + entry(slot, other) * step[other]);
                 let inward = if step[slot] <= low[slot] { -slope } else { slope };
                 if inward > steepest {
                     (release, steepest) = (Some(slot), inward);
@@ -229,15 +231,20 @@ fn box_step(
 }
 
 /// Minimiser over the joints that are not active, the others being as in `step`: Cholesky, row by row.
-fn solve_free(count: usize, hessian: &Square, gradient: &Angles, step: &Angles, active: &[bool; N]) -> Option<Angles> {
-    let mut factor = [[0.0; N]; N];
+fn solve_free<const C: usize>(
+    hessian: &Square<C>,
+    gradient: &Row<C>,
+    step: &Row<C>,
+    active: &[bool; C],
+) -> Option<Row<C>> {
+    let mut factor = [[0.0; C]; C];
     let mut out = *step;
-    for row in 0..count {
+    for row in 0..C {
         if active[row] {
             continue;
         }
         let mut right = -gradient[row];
-        for other in 0..count {
+        for other in 0..C {
             if active[other] {
                 let value = if row >= other { hessian[row][other] } else { hessian[other][row] };
                 right -= value * step[other];
@@ -265,11 +272,11 @@ fn solve_free(count: usize, hessian: &Square, gradient: &Angles, step: &Angles, 
         factor[row][row] = 1.0 / pivot.sqrt();
         out[row] = right * factor[row][row];
     }
-    for row in (0..count).rev() {
+    for row in (0..C).rev() {
         if active[row] {
             continue;
         }
-        for below in row + 1..count {
+        for below in row + 1..C {
             if !active[below] {
                 out[row] -= factor[below][row] * out[below];
             }

@@ -44,6 +44,8 @@ pub const HYSTERESIS: f64 = 0.1;
 /// Most by which it may be worse, m.
 pub const HYSTERESIS_MAX: f64 = 1e-4;
 
+// Postures nearer to each other than this are in one valley, rad: less than the scan's nodes are apart.
+const SAME_VALLEY: f64 = 0.1;
 // Iterations of one descent.
 const BUDGET: u16 = 24;
 
@@ -146,6 +148,10 @@ impl FingerIk {
         let cap = known.map_or(f64::INFINITY, |known| known.cap);
         self.for_each_seed(&problem, known, |seed, bound| {
             if bound >= best.map_or(f64::INFINITY, |best| best.cost.min(cap)) {
+                return;
+            }
+            // The scan finds the start's own valley too, and there the floor is known.
+            if kept.is_some_and(|kept| kept.converged && apart(seed, &kept.q) < SAME_VALLEY) {
                 return;
             }
             let other = problem.descend(seed, BUDGET);

@@ -126,7 +126,8 @@ impl TipObjective {
     fn state<const N: usize>(&self, hand: &HandModel, q: SVector<f64, N>) -> State<N> {
         let mut tips = [(Vector3::zeros(), TipJacobian::zeros(), [Vector3::zeros(); MAX_FINGER_JOINTS]); MAX_FINGERS];
         for (tip, chain) in tips.iter_mut().zip(&hand.fingers) {
-            *tip = chain.differential(&chain.select(q.as_slice())[..chain.joints.len()], TipFrame::Pole);
+            let (pole, columns, axes) = chain.differential(&chain.select(q.as_slice()), TipFrame::Pole);
+            *tip = (pole, TipJacobian::from_columns(&columns), axes);
         }
         let mut value = self.temporal * (q - padded(&self.last)).norm_squared();
         for term in self.terms() {
