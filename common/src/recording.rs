@@ -4,7 +4,7 @@
 //! - CSV of keypoints: a header, then per row frame, time (s) and x, y, z (m) of the 21 keypoints.
 //! - JSON lines: `{"t": s, "q": [20 angles, rad]}` or `{"t": s, "keypoints": [[x, y, z] x 21, m]}` per line, after an
 //!   optional first line `{"format":"allegro-teleop-recording","version":1}`, which may also hold `side`,
-//!   `geometry` and `source`.
+//!   `geometry`, `tuning` and `source`.
 
 mod error;
 
@@ -14,7 +14,8 @@ use serde::{Deserialize, Serialize};
 
 pub use self::error::{FrameError, RecordingError};
 use crate::hand::HandSide;
-use crate::master::{KEYPOINT_NAMES, Keypoints, MAX_ANGLE, MasterGeometry};
+use crate::mapping::Tuning;
+use crate::master::{KEYPOINT_NAMES, Keypoints, MAX_ANGLE, MasterError, MasterGeometry};
 
 /// Longest line read, bytes.
 pub const MAX_LINE: usize = 64 * 1024;
@@ -55,6 +56,9 @@ pub struct RecordingHeader {
     /// The operator's hand, for joint angles.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub geometry: Option<MasterGeometry>,
+    /// What the mapping should know about the operator, for joint angles.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub tuning: Option<Tuning>,
     /// Where the frames came from.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub source: Option<String>,
@@ -393,6 +397,9 @@ fn parse_header(line: &str) -> Result<Option<RecordingHeader>, RecordingError> {
         serde_json::from_value(object.into()).map_err(|error| RecordingError::JsonHeader(error.to_string()))?;
     if let Some(geometry) = &header.geometry {
         geometry.validate()?;
+    }
+    if let Some(tuning) = &header.tuning {
+        tuning.validate().map_err(MasterError::from)?;
     }
     Ok(Some(header))
 }

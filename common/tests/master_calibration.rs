@@ -5,10 +5,11 @@ mod master_support;
 
 use master_support::{Noise, keypoints, noisy, recorded};
 use proptest::prelude::*;
-use teleop_common::hand::{Finger, HandSide};
+use teleop_common::hand::{Finger, HandModel, HandSide};
+use teleop_common::mapping::MappingParams;
 use teleop_common::master::{
     Calibration, CalibrationError, CalibrationTextError, Calibrator, Gesture, Keypoints, MAX_FRAMES, MIN_FRAMES,
-    MasterGeometry, OPEN, PalmFrame,
+    MasterGeometry, OPEN, PalmFrame, Touch,
 };
 
 /// A person's hand, larger than the paradigmatic one.
@@ -140,6 +141,28 @@ fn file_round_trip_and_refusals() {
     let side = refuse("\"right\"", "\"middle\"").to_string();
     assert!(side.contains("middle"), "{side}");
     assert!(matches!(refuse("residual = ", "residual = -"), CalibrationTextError::Statistic { .. }));
+    let mut tuned = calibration.clone();
+    let hand = HandModel::allegro_v4(HandSide::Right);
+    assert!(tuned.tune(&hand, &MappingParams::default()).unwrap()[0].contains("tuned for allegro-v4-right"));
+    let values = tuned.tuning.as_ref().unwrap().values;
+    let text_tuned = tuned.to_text();
+    assert!(text_tuned.contains("[tuning]\nhand = \"allegro-v4-right\"\n"), "{text_tuned}");
+    let mut read = Calibration::from_text(&text_tuned).unwrap();
+    assert_eq!(read, tuned);
+    // Known already: nothing to work out, nothing to tell; for another hand there is.
+    assert!(read.tune(&hand, &MappingParams::default()).unwrap().is_empty());
+    assert!(!read.tune(&HandModel::allegro_v4(HandSide::Left), &MappingParams::default()).unwrap().is_empty());
+    let wrong = text_tuned.replacen(&format!("r1 = {}", values.r1), "r1 = -1.0", 1);
+    let wrong = Calibration::from_text(&wrong).unwrap_err().to_string();
+    assert!(wrong.contains("r1 of the thumb is -1"), "{wrong}");
+    // A file from before there were touches and tunings.
+    let (before, _) = text.split_once("[calibration.touch]").unwrap();
+    let old = Calibration::from_text(before).unwrap();
+    assert_eq!(old, Calibration { touch: Touch::default(), ..calibration.clone() });
+    let far = text.split_once("distance = [").unwrap();
+    let far = format!("{}distance = [0.06, {}", far.0, far.1.split_once(", ").unwrap().1);
+    assert_eq!(Calibration::from_text(&far), Err(CalibrationTextError::Touch { value: 0.06 }));
+
     let mut huge = calibration;
     huge.geometry.phalanges[2][0] = 40.0;
     assert!(matches!(Calibration::from_text(&huge.to_text()), Err(CalibrationTextError::Implausible(_))));

@@ -9,6 +9,7 @@ use std::io::Cursor;
 use master_support::keypoints;
 use proptest::prelude::*;
 use teleop_common::hand::HandSide;
+use teleop_common::mapping::MappingParams;
 use teleop_common::master::{Gesture, KEYPOINT_NAMES, MasterGeometry, OPEN};
 use teleop_common::recording::{
     Frame, FrameData, FrameError, LastLine, MAX_LINE, MAX_MESSAGE, RecordingError, RecordingHeader, RecordingReader,
@@ -45,6 +46,7 @@ fn header() -> RecordingHeader {
     RecordingHeader {
         side: Some(HandSide::Right),
         geometry: Some(MasterGeometry::PARADIGMATIC),
+        tuning: Some(MappingParams::default().tuned(None)),
         source: Some("tour".into()),
     }
 }

@@ -1,10 +1,12 @@
-//! The tuner against the reference's coverage figures.
+//! The tuner against the reference's coverage figures, and on a person's recording.
 
 #![allow(clippy::unwrap_used, reason = "helpers of tests")]
 
 use teleop_common::hand::{Finger, HandModel, HandSide};
-use teleop_common::mapping::{Anchor, Judge, MappingParams, Tuning, contacts, tune};
-use teleop_common::master::MasterGeometry;
+use teleop_common::mapping::{Anchor, Judge, MappingParams, Retargeter, Tuning, contacts, tune};
+use teleop_common::master::{Calibration, Calibrator, Fitter, Keypoints, MasterGeometry, MasterPose};
+use teleop_common::recording::{FrameData, LastLine, RecordingReader};
+use teleop_common::testing::shared_data;
 
 const FINGERS: [Finger; 3] = [Finger::Index, Finger::Middle, Finger::Ring];
 
@@ -72,4 +74,114 @@ fn tuning_is_deterministic_and_the_same_for_both_hands() {
     assert_eq!(right.tuning, tune(HandSide::Right).tuning);
     assert_eq!(right.tuning, tune(HandSide::Left).tuning);
     assert_eq!(right.tuning.r1, 0.025);
+}
+
+/// The person of the recording, measured and tuned as `robot retarget` does it.
+fn person() -> Option<(Vec<Keypoints>, Calibration)> {
+    let path = shared_data("human_hand_right.csv")?;
+    let input = std::io::BufReader::new(std::fs::File::open(path).unwrap());
+    let frames: Vec<Keypoints> = RecordingReader::new(input, LastLine::Whole)
+        .unwrap()
+        .map(|frame| match frame.unwrap().data {
+            FrameData::Keypoints(keypoints) => keypoints,
+            FrameData::Joints(_) => unreachable!("the recording is of keypoints"),
+        })
+        .collect();
+    let mut calibrator = Calibrator::default();
+    frames.iter().for_each(|frame| calibrator.push(frame));
+    Some((frames, calibrator.finish().unwrap()))
+}
+
+#[test]
+fn a_persons_contacts_close_too() {
+    let Some((_, mut person)) = person() else { return };
+    let hand = hand();
+    person.tune(&hand, &MappingParams::default()).unwrap().iter().for_each(|line| println!("{line}"));
+    let tuning = person.tuning.as_ref().unwrap().values;
+    let judge = Judge::new(&hand, hand.joint_map("split").unwrap());
+    for finger in FINGERS {
+        let sample = contacts(&person.geometry, finger, tuning.contact[finger.index()], 400, 1_000_000);
+        let share = |scale| judge.coverage(&sample, finger, scale, Anchor::Projected);
+        let (tuned, paper) = (share(tuning.scale[0]), share(2.7));
+        println!(
+            "{:6} {:.1} % of {} other contacts; at 2.7 {:.1} %",
+            finger.name(),
+            tuned * 100.0,
+            sample.len(),
+            paper * 100.0
+        );
+        assert!(tuned >= 0.98, "{finger:?} {tuned}");
+    }
+}
+
+/// Gaps of the robot's poles (m) in frames whose keypoints of thumb and finger are less than `below` (m) apart.
+fn gaps(frames: &[Keypoints], person: &Calibration, tuning: Option<Tuning>, finger: Finger, below: f64) -> Vec<f64> {
+    let mut fitter = Fitter::new(person.geometry, person.side);
+    let mut retargeter = Retargeter::new(hand(), MappingParams::default()).unwrap();
+    let mut gaps = Vec::new();
+    for frame in frames {
+        let output = retargeter.map(&MasterPose { tuning, ..fitter.pose(frame) });
+        if (frame.finger(Finger::Thumb)[3] - frame.finger(finger)[3]).norm() < below {
+            gaps.push((output.finger(Finger::Thumb).unwrap().p - output.finger(finger).unwrap().p).norm());
+        }
+    }
+    gaps.sort_by(f64::total_cmp);
+    gaps
+}
+
+#[test]
+fn a_persons_touch_is_a_robot_touch() {
+    let Some((frames, mut person)) = person() else { return };
+    person.report().last().iter().for_each(|line| println!("{line}"));
+    let touch = person.touch;
+    assert!(touch.frames[1] >= 20 && (0.022..0.030).contains(&touch.distance[1]), "{touch:?}");
+    // Index and middle were seen touching, ring and little never: they take what was seen.
+    assert!(touch.frames[3] == 0 && touch.distance[3] == touch.distance[4] && touch.distance[3] > 0.02, "{touch:?}");
+    person.tune(&hand(), &MappingParams::default()).unwrap();
+    let tuning = person.tuning.as_ref().map(|tuning| tuning.values);
+    for (finger, below) in [(Finger::Index, 0.025), (Finger::Index, 0.030), (Finger::Middle, 0.030)] {
+        let summary = |gaps: &[f64]| {
+            let mean = gaps.iter().sum::<f64>() / gaps.len() as f64;
+            (mean * 1e3, gaps[gaps.len() * 95 / 100] * 1e3)
+        };
+        let before = summary(&gaps(&frames, &person, None, finger, below));
+        let after = gaps(&frames, &person, tuning, finger, below);
+        let (mean, p95) = summary(&after);
+        println!(
+            "{:6} keypoints below {:.0} mm in {} frames: gap mean {mean:.2} mm, p95 {p95:.2}; before {:.1}, {:.1}",
+            finger.name(),
+            below * 1e3,
+            after.len(),
+            before.0,
+            before.1
+        );
+        assert!(mean <= 2.0 && p95 <= 5.0, "{finger:?} {mean} {p95}");
+    }
+}
+
+#[test]
+fn any_valid_hand_gets_a_valid_tuning() {
+    let small = {
+        let mut geometry = MasterGeometry::PARADIGMATIC;
+        geometry.bases.as_flattened_mut().iter_mut().for_each(|x| *x *= 0.6);
+        geometry.phalanges.as_flattened_mut().iter_mut().for_each(|x| *x *= 0.6);
+        geometry
+    };
+    let mut no_thumb = MasterGeometry::PARADIGMATIC;
+    no_thumb.phalanges[0] = [0.003; 3];
+    let mut huge = MasterGeometry::PARADIGMATIC;
+    huge.phalanges = [[0.15; 3]; 5];
+    for (name, geometry) in [("small", small), ("no thumb", no_thumb), ("huge", huge)] {
+        geometry.validate().unwrap();
+        for contact in [0.0, 0.05] {
+            let tuned = tune(&hand(), &MappingParams::default(), &geometry, &[contact; 5]).unwrap();
+            println!("{name}: {}", tuned.report()[0]);
+            tuned.tuning.validate().unwrap();
+            if name == "no thumb" && contact == 0.0 {
+                assert_eq!(tuned.tuning.scale, [1.6; 5], "nothing to go by");
+            }
+        }
+    }
+    let scale = |geometry| tune(&hand(), &MappingParams::default(), geometry, &[0.0; 5]).unwrap().tuning.scale[0];
+    assert!(scale(&small) > 1.3 * scale(&MasterGeometry::PARADIGMATIC), "a small hand is scaled up");
 }

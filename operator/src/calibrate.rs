@@ -1,4 +1,4 @@
-//! `operator calibrate`: measures a person's hand and saves its sizes.
+//! `operator calibrate`: measures a person's hand, tunes the mapping for it, and saves both.
 
 use std::path::Path;
 use std::time::{Duration, Instant};
@@ -32,10 +32,11 @@ pub fn calibrate(args: &CalibrateArgs, shutdown: &Shutdown) -> Result<(), Failur
             return Err(Failure::Usage(error));
         }
     };
-    let calibration =
+    let mut calibration =
         calibrator.finish().with_context(|| format!("cannot calibrate from {:?}", args.source)).or_runtime()?;
+    let tuned = args.robot_hand.tune(&mut calibration);
     save(&calibration, &args.output).or_runtime()?;
-    for line in calibration.report() {
+    for line in calibration.report().into_iter().chain(tuned) {
         say(&line).ok();
     }
     say(&format!("saved to {}", args.output.display())).ok();

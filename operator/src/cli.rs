@@ -5,6 +5,8 @@ use std::path::PathBuf;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use teleop_common::viz::Viewer;
 
+use crate::robot_hand::RobotHand;
+
 /// Where the robot listens by default.
 pub const ROBOT_ENDPOINT: &str = "tcp/127.0.0.1:7447";
 /// Where the operator listens for hand data by default.
@@ -46,7 +48,7 @@ pub enum Command {
     /// Stream a hand to the robot (this is what `operator` alone does)
     #[command(after_help = EXAMPLES)]
     Run(RunArgs),
-    /// Measure a person's hand from keypoints and save its sizes for `--calibration`
+    /// Measure a person's hand from keypoints, tune the mapping for it, and save both for `--calibration`
     Calibrate(CalibrateArgs),
     /// Show what the robot does, without driving it
     Watch(WatchArgs),
@@ -98,6 +100,9 @@ pub struct RunArgs {
     /// Take the tracker's noise out of keypoints; joint angles are sent as they are
     #[arg(long, value_enum, default_value = "on")]
     pub filter: Switch,
+    /// The robot hand that the mapping of keypoints is tuned for, unless the calibration file says how already
+    #[arg(long, value_enum, default_value_t, value_name = "HAND")]
+    pub robot_hand: RobotHand,
     /// Where hand data of `--source zenoh` may arrive; repeatable
     #[arg(long, default_value = INPUT_ENDPOINT, value_name = "ENDPOINT")]
     pub listen: Vec<String>,
@@ -121,6 +126,9 @@ pub struct CalibrateArgs {
     /// Keypoints: FILE.csv, FILE.jsonl, or zenoh for live ones on allegro/v1/NAME/in/hand
     #[arg(long, value_name = "SOURCE")]
     pub source: String,
+    /// The robot hand that the mapping is to be tuned for
+    #[arg(long, value_enum, default_value_t, value_name = "HAND")]
+    pub robot_hand: RobotHand,
     /// Where to save the sizes
     #[arg(long, value_name = "FILE")]
     pub output: PathBuf,

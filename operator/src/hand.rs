@@ -3,11 +3,14 @@
 use std::time::Duration;
 
 use teleop_common::hand::HandSide;
+use teleop_common::mapping::Tuning;
 use teleop_common::master::{
     Calibration, CalibrationError, Calibrator, Diagnosis, Filter, FilterSettings, Fitter, Inspector, MIN_FRAMES,
     MasterGeometry, MasterPose,
 };
 use teleop_common::recording::FrameData;
+
+use crate::robot_hand::RobotHand;
 
 /// How long a hand is measured before it is followed, unless it was calibrated before.
 pub const MEASURE: Duration = Duration::from_secs(3);
@@ -51,6 +54,9 @@ pub struct PoseFinder {
     /// For joint angles.
     geometry: MasterGeometry,
     filtered: bool,
+    tuning: Option<Tuning>,
+    /// For keypoints.
+    robot_hand: RobotHand,
     tracker: Tracker,
     last: Option<Duration>,
 }
@@ -61,7 +67,7 @@ enum Tracker {
     /// Not known whose hand it is.
     Measuring { calibrator: Box<Calibrator>, since: Option<Duration> },
     /// A known hand.
-    Following { fitter: Box<Fitter>, filter: Box<Filter>, inspector: Inspector, side: HandSide },
+    Following { fitter: Box<Fitter>, filter: Box<Filter>, inspector: Inspector, side: HandSide, tuning: Option<Tuning> },
 }
 
 impl Tracker {
@@ -75,6 +81,7 @@ impl Tracker {
             fitter: Box::new(Fitter::new(calibration.geometry, calibration.side)),
             inspector: Inspector::default(),
             side: calibration.side,
+            tuning: calibration.tuning.as_ref().map(|tuning| tuning.values),
         }
     }
 }
@@ -83,14 +90,27 @@ impl PoseFinder {
     /// For joint angles of this hand; keypoints, should they come, are measured for [`MEASURE`] first.
     #[must_use]
     pub fn new(geometry: MasterGeometry) -> Self {
-        Self { geometry, filtered: true, tracker: Tracker::measuring(), last: None }
+        Self {
+            geometry,
+            filtered: true,
+            tuning: None,
+            robot_hand: RobotHand::default(),
+            tracker: Tracker::measuring(),
+            last: None,
+        }
+    }
+
+    /// With what is known about the operator of the joint angles, and the robot hand that a hand will be tuned for after
+    /// it was measured.
+    #[must_use]
+    pub fn with_tuning(self, tuning: Option<Tuning>, robot_hand: RobotHand) -> Self {
+        Self { tuning, robot_hand, ..self }
     }
 
     /// For joint angles or keypoints of a person that was measured.
     #[must_use]
     pub fn calibrated(calibration: &Calibration) -> Self {
-        let tracker = Tracker::following(calibration);
-        Self { geometry: calibration.geometry, filtered: true, tracker, last: None }
+        Self { tracker: Tracker::following(calibration), ..Self::new(calibration.geometry) }
     }
 
     /// The same with or without the [`Filter`], which takes the tracker's noise out of keypoints; it is on at first.
@@ -107,7 +127,7 @@ impl PoseFinder {
         let keypoints = match hand {
             FrameData::Joints(q) => {
                 return Posed::Pose {
-                    pose: MasterPose { q: *q, geometry: self.geometry, tuning: None },
+                    pose: MasterPose { q: *q, geometry: self.geometry, tuning: self.tuning },
                     residual: None,
                 };
             }
@@ -121,7 +141,8 @@ impl PoseFinder {
                     return Posed::Measuring { done: elapsed.as_secs_f64() / MEASURE.as_secs_f64() };
                 }
                 match calibrator.finish() {
-                    Ok(calibration) => {
+                    Ok(mut calibration) => {
+                        self.robot_hand.tune_and_log(&mut calibration);
                         let report: Vec<String> = calibration.report().into_iter().take(2).collect();
                         tracing::info!("measured: {}", report.join(", "));
                         self.tracker = Tracker::following(&calibration);
@@ -137,7 +158,7 @@ impl PoseFinder {
                     }
                 }
             }
-            Tracker::Following { fitter, filter, inspector, side } => {
+            Tracker::Following { fitter, filter, inspector, side, tuning } => {
                 inspector.push(keypoints);
                 if let Some(diagnosis) = inspector.diagnose(*side, false) {
                     filter.reset();
@@ -148,7 +169,7 @@ impl PoseFinder {
                     filter.reset();
                 }
                 let fit = fitter.fit(keypoints);
-                let mut pose = MasterPose { q: fit.q, geometry: *fitter.geometry(), tuning: None };
+                let mut pose = MasterPose { q: fit.q, geometry: *fitter.geometry(), tuning: *tuning };
                 if self.filtered {
                     pose.q = filter.apply(since.as_secs_f64(), keypoints, &fit.q);
                 }

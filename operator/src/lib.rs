@@ -4,6 +4,7 @@
 //! |---|---|
 //! | [`source`] | where a hand comes from: gestures, recordings, other programs; pure in time |
 //! | [`hand`] | joint angles or keypoints to poses of the master hand |
+//! | [`robot_hand`] | the robot hand that a person's hand is tuned for |
 //! | [`pipeline`] | the source thread: frames in, poses out |
 //! | [`stream`] | the publisher thread behind a latest-value slot |
 //! | [`feedback`] | the robot as last heard, round trip, clock offset |
@@ -25,6 +26,7 @@ pub mod hand;
 pub mod listen;
 pub mod pipeline;
 pub mod record;
+pub mod robot_hand;
 pub mod run;
 pub mod shutdown;
 pub mod source;

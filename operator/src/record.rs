@@ -85,7 +85,7 @@ impl Recorder {
     /// [`RecordError::Create`] if there is such a file already, or it cannot be made.
     pub fn create(path: &Path, source: &str, side: Option<HandSide>) -> Result<(Self, RecordSender), RecordError> {
         let file = File::create_new(path).map_err(|error| RecordError::Create { path: path.to_owned(), error })?;
-        let header = RecordingHeader { side, geometry: None, source: Some(source.to_owned()) };
+        let header = RecordingHeader { side, source: Some(source.to_owned()), ..RecordingHeader::default() };
         let (queue, frames) = sync_channel(QUEUE);
         let counters = Arc::new(Counters::default());
         let count = Arc::clone(&counters);
@@ -114,9 +114,10 @@ impl Recorder {
 }
 
 fn write(file: File, mut header: RecordingHeader, frames: &Receiver<Outgoing>, counters: &Counters) {
-    // The hand's sizes are known with the first pose.
+    // The hand's sizes and tuning are known with the first pose.
     let first = frames.recv().ok();
     header.geometry = first.map(|outgoing| outgoing.pose.geometry);
+    header.tuning = first.and_then(|outgoing| outgoing.pose.tuning);
     let mut writer = match RecordingWriter::new(&file, &header) {
         Ok(writer) => Some(writer),
         Err(error) => {

@@ -10,6 +10,7 @@ use teleop_common::key::Keys;
 use teleop_common::master::{Calibration, MasterGeometry};
 use teleop_common::net::clock::{now, random_epoch};
 use teleop_common::net::{Session, Stream};
+use teleop_common::recording::RecordingHeader;
 use teleop_common::viz::{Level, Scene, Viz};
 
 use crate::calibrate;
@@ -20,6 +21,7 @@ use crate::hand::PoseFinder;
 use crate::listen::Listener;
 use crate::pipeline::{Parts, Pipeline, Progress, picture_time};
 use crate::record::Recorder;
+use crate::robot_hand::RobotHand;
 use crate::shutdown::Shutdown;
 use crate::source::{GestureSource, RecordingFile, Source, SourceSpec, ZenohSource};
 use crate::stream::PoseStream;
@@ -89,29 +91,35 @@ enum Input {
 impl Plan {
     fn new(args: &RunArgs) -> Result<Self, Failure> {
         let spec = args.source.parse::<SourceSpec>().or_usage()?;
+        let hand = args.robot_hand;
         let calibration = args.calibration.as_deref().map(calibrate::load).transpose().or_usage()?;
         match spec {
             SourceSpec::Gesture(gesture) => {
                 let source = Source::Gesture(GestureSource::new(gesture, args.rate));
-                Ok(Self::with(Input::Ready(source), calibration.as_ref(), None))
+                Ok(Self::with(Input::Ready(source), calibration, None, hand))
             }
-            SourceSpec::Zenoh => Ok(Self::with(Input::Zenoh, calibration.as_ref(), None)),
+            SourceSpec::Zenoh => Ok(Self::with(Input::Zenoh, calibration, None, hand)),
             SourceSpec::File(path) => {
                 let recording = RecordingFile::scan(&path).or_usage()?;
-                let (calibration, geometry) = (recording_hand(&recording, calibration)?, recording.header.geometry);
-                let side = recording.header.side;
+                let calibration = recording_hand(&recording, calibration)?;
+                let header = recording.header.clone();
                 let source = recording.play(args.speed, args.repeat).or_runtime()?;
-                let mut plan = Self::with(Input::Ready(Source::File(Box::new(source))), calibration.as_ref(), geometry);
-                plan.side = plan.side.or(side);
+                let input = Input::Ready(Source::File(Box::new(source)));
+                let mut plan = Self::with(input, calibration, Some(&header), hand);
+                plan.side = plan.side.or(header.side);
                 Ok(plan)
             }
         }
     }
 
-    fn with(input: Input, calibration: Option<&Calibration>, geometry: Option<MasterGeometry>) -> Self {
-        let geometry = geometry.unwrap_or(MasterGeometry::PARADIGMATIC);
-        let finder = calibration.map_or_else(|| PoseFinder::new(geometry), PoseFinder::calibrated);
-        Self { input, finder, side: calibration.map(|calibration| calibration.side) }
+    fn with(input: Input, calibration: Option<Calibration>, header: Option<&RecordingHeader>, hand: RobotHand) -> Self {
+        let Some(mut calibration) = calibration else {
+            let geometry = header.and_then(|header| header.geometry).unwrap_or(MasterGeometry::PARADIGMATIC);
+            let tuning = header.and_then(|header| header.tuning);
+            return Self { input, finder: PoseFinder::new(geometry).with_tuning(tuning, hand), side: None };
+        };
+        hand.tune_and_log(&mut calibration);
+        Self { input, finder: PoseFinder::calibrated(&calibration), side: Some(calibration.side) }
     }
 
     const fn is_live(&self) -> bool {

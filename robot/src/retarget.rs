@@ -40,7 +40,8 @@ pub fn run(args: &RetargetArgs) -> anyhow::Result<()> {
         Switch::Off => None,
     };
     let started = Instant::now();
-    let frames = Frames::open(&args.input, args.calibration.as_deref(), hand.side, args.filter == Switch::On)?;
+    let filtered = args.filter == Switch::On;
+    let frames = Frames::open(&args.input, args.calibration.as_deref(), &hand, &config.mapping, filtered)?;
     let mut output = Partial::create(&args.output)?;
     let mut samples = args.quality.is_some().then(Vec::new);
     let bar = progress(&args.input);

@@ -235,15 +235,20 @@ fn a_recording_of_keypoints_is_mapped_onto_either_hand() {
         let hand = HandModel::allegro_v4(side);
         let rows = job.rows(&["--hand", side.name()]);
         assert_eq!(rows.len(), 400);
-        let mut pinched: f64 = 1.0;
+        let mut gaps = Vec::new();
         for row in &rows {
             for (value, joint) in numbers(&row["q"]).iter().zip(&hand.joints) {
                 assert!((joint.lower..=joint.upper).contains(value), "{} at {value}", joint.name);
             }
-            pinched = pinched.min((point(row, "p", Finger::Index) - point(row, "p", Finger::Thumb)).norm());
+            if of(row, "delta", Finger::Index) < 0.025 {
+                gaps.push((point(row, "p", Finger::Index) - point(row, "p", Finger::Thumb)).norm());
+            }
         }
-        println!("{}: closest pinch of index and thumb {:.1} mm", side.name(), pinched * 1e3);
-        assert!(pinched < 0.03, "the pinches of the recording are not there: {pinched} m");
+        // The person's touch is tuned to be the robot's.
+        gaps.sort_by(f64::total_cmp);
+        let worst = gaps.last().unwrap();
+        println!("{}: gap of index and thumb at most {:.2} mm in {} frames", side.name(), worst * 1e3, gaps.len());
+        assert!(*worst < 0.002 && gaps.len() >= 5, "{gaps:?}");
         // Pinches of the recording: frames 311 to 333.
         let closest = rows[311..333].iter().map(|row| of(row, "delta", Finger::Index)).fold(1.0, f64::min);
         assert!(closest < 0.03, "{closest} m");

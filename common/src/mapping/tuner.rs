@@ -1,6 +1,6 @@
 use nalgebra::{Matrix3, Vector3, Vector4};
 
-use super::{Anchor, CartesianMap, MappingParams, ParamError, Pinned, Retargeter, Tuning, TuningUse};
+use super::{Anchor, CartesianMap, MappingMode, MappingParams, ParamError, Pinned, Retargeter, Tuning, TuningUse};
 use crate::hand::{Finger, FingerChain, HandModel, JointMap, MAX_FINGERS, TipFrame};
 use crate::ik::{FingerIk, POSTURE_WEIGHT_MIN};
 use crate::master::{JOINT_LIMITS, MasterGeometry, MasterPose, OPEN, minimum_jerk};
@@ -8,12 +8,12 @@ use crate::master::{JOINT_LIMITS, MasterGeometry, MasterPose, OPEN, minimum_jerk
 /// A contact closes if the robot's poles come this near, m.
 const CLOSED: f64 = 0.001;
 /// Contacts of each finger that are judged.
-const CONTACTS: usize = 200;
+const CONTACTS: usize = 150;
 /// Share of them that should close.
 const TARGET: f64 = 0.99;
-/// c_s looked at.
+/// c_s looked at, in tenths.
 const SCALES: std::ops::RangeInclusive<u32> = 8..=28;
-const SCALE_STEP: f64 = 0.1;
+const SCALES_PER_UNIT: f64 = 10.0;
 /// Most a finger's scale may exceed the thumb's: beyond it the shape of the grasp suffers.
 const MAX_RATIO: f64 = 1.25;
 /// r1 of an exact hand, m, and by how much r1 exceeds the distance at which keypoints touch: k = 1 there, whatever the
@@ -22,7 +22,7 @@ const R1: f64 = 0.020;
 const R1_MARGIN: f64 = 0.005;
 /// r2 looked at: the width of the transition, m. A wider one would move fingers that the person does not bring near the
 /// thumb.
-const WIDTHS: [f64; 5] = [0.030, 0.040, 0.050, 0.060, 0.070];
+const WIDTHS: [f64; 4] = [0.030, 0.040, 0.050, 0.060];
 /// Duration of a tap, s, that the robot should follow; the contacts of each finger tried; and the steps per second.
 const TAP: f64 = 2.0;
 const TAPS: usize = 5;
@@ -48,8 +48,8 @@ pub struct Tuned {
 /// c_s of the thumb's map is the largest at which 99 % of the contacts of every finger close, or the one that closes
 /// most; c_s of a finger the largest at which 99 % of its own do, at most a quarter above the thumb's. r1 is 5 mm beyond
 /// the contacts, r2 as close as taps of 2 s allow without exceeding the speed of the robot's joints (the transition
-/// multiplies the speed by up to `1 + pi D / (2 (r2 - r1))`, D the distance of the two targets). Deterministic; takes a
-/// fraction of a second.
+/// multiplies the speed by up to `1 + pi D / (2 (r2 - r1))`, D the distance of the two targets), but at most 60 mm wider.
+/// Deterministic; takes a second or less.
 ///
 /// # Errors
 /// A joint map that the hand does not have, or a parameter out of its range.
@@ -60,7 +60,8 @@ pub fn tune(
     contact: &[f64; MAX_FINGERS],
 ) -> Result<Tuned, ParamError> {
     // The tuning that is being made is to hold, whatever the robot will do with it.
-    let params = MappingParams { tuning: TuningUse::Operator, pinned: Pinned::default(), ..params.clone() };
+    let (mode, pinned) = (MappingMode::Combined, Pinned::default());
+    let params = MappingParams { mode, tuning: TuningUse::Operator, pinned, ..params.clone() };
     let mut retargeter = Retargeter::new(hand.clone(), params)?;
     let joint_map = retargeter.joint_map().clone();
     let judge = Judge::new(hand, &joint_map);
@@ -72,17 +73,27 @@ pub fn tune(
         .filter(|(_, contacts)| !contacts.is_empty())
         .collect();
 
-    let coverage: Vec<(f64, [Option<f64>; 4])> = SCALES
-        .map(|step| {
-            let scale = SCALE_STEP * f64::from(step);
-            let mut shares = [None; 4];
-            for (finger, contacts) in &samples {
-                shares[finger.index() - 1] = Some(judge.coverage(contacts, *finger, scale, Anchor::Projected));
-            }
-            (scale, shares)
-        })
-        .collect();
-    let thumb = largest(&coverage, |shares| shares.iter().flatten().copied().fold(1.0, f64::min));
+    let mut coverage = Vec::new();
+    let mut best = 0.0_f64;
+    for scale in SCALES.map(|step| f64::from(step) / SCALES_PER_UNIT) {
+        let mut shares = [None; 4];
+        for (finger, contacts) in &samples {
+            shares[finger.index() - 1] = Some(judge.coverage(contacts, *finger, scale, Anchor::Projected));
+        }
+        coverage.push((scale, shares));
+        let most = shares.iter().flatten().copied().fold(0.0, f64::max);
+        best = best.max(most);
+        if most < 0.8 * best {
+            // Larger ones only close less.
+            break;
+        }
+    }
+    // A thumb that reaches no finger says nothing either.
+    let thumb = if samples.is_empty() {
+        retargeter.params().scale
+    } else {
+        largest(&coverage, |shares| shares.iter().flatten().copied().fold(1.0, f64::min))
+    };
     let mut scale = [thumb; MAX_FINGERS];
     for (finger, _) in &samples {
         let own = largest(&coverage, |shares| shares[finger.index() - 1].unwrap_or(1.0));

@@ -25,6 +25,8 @@ const MAX_SPREAD: f64 = 0.25;
 const TOUCH: f64 = 0.020;
 /// Farthest apart that touching keypoints can be, m.
 const MAX_TOUCH: f64 = 0.030;
+/// The same as far as a file may say so, m.
+const READABLE_TOUCH: f64 = 0.050;
 /// How far the distance scatters while fingers touch, m.
 const TOUCH_SCATTER: f64 = 0.006;
 /// Fewest frames of a finger's touches to go by.
@@ -164,6 +166,12 @@ pub enum CalibrationTextError {
     /// A tuning no operator can have.
     #[error("calibration file: {0}")]
     Tuning(#[from] TuningError),
+    /// A distance at which no fingers touch.
+    #[error("calibration file: touch.distance has {value}; expected 0 to {READABLE_TOUCH} m")]
+    Touch {
+        /// The value.
+        value: f64,
+    },
     /// A statistic that is no number of metres.
     #[error("calibration file: {field} is {value}; expected a finite number of metres, not negative")]
     Statistic {
@@ -448,8 +456,10 @@ impl Calibration {
         calibration.spread.bases.iter().try_for_each(|&value| statistic("spread.bases", value))?;
         let phalanges = calibration.spread.phalanges.iter().flatten();
         phalanges.copied().try_for_each(|value| statistic("spread.phalanges", value))?;
-        calibration.touch.distance.iter().try_for_each(|&value| statistic("touch.distance", value))?;
-        Ok(calibration)
+        match calibration.touch.distance.iter().find(|&value| !(0.0..=READABLE_TOUCH).contains(value)) {
+            Some(&value) => Err(CalibrationTextError::Touch { value }),
+            None => Ok(calibration),
+        }
     }
 
     /// Lines for a person to read.
@@ -475,5 +485,36 @@ impl Calibration {
         });
         lines.push(format!("touches the thumb up to a distance of: {}", touch.collect::<Vec<_>>().join(", ")));
         lines
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Thumb-finger distances (mm) of index, middle, ring, little in m.
+    fn frame(fingers: [f64; 4]) -> [f64; MAX_FINGERS] {
+        let [index, middle, ring, little] = fingers.map(|distance| distance * 1e-3);
+        [0.0, index, middle, ring, little]
+    }
+
+    #[test]
+    fn touches_are_the_bottoms_of_the_dips_of_the_closest_finger() {
+        // Two pinches of the index with the middle beside it, and a short one of the middle.
+        let mut frames = Vec::new();
+        for bottom in [18.0, 22.0] {
+            frames.extend([90.0, 60.0, 29.0].map(|index| frame([index, 40.0, 80.0, 95.0])));
+            frames.extend([0.0, 1.0, 2.0, 1.5, 0.5].map(|more| frame([bottom + more, 28.4, 80.0, 95.0])));
+            frames.extend([50.0, 90.0].map(|index| frame([index, 40.0, 80.0, 95.0])));
+        }
+        frames.extend([45.0, 25.0, 26.0, 45.0].map(|middle| frame([70.0, middle, 60.0, 80.0])));
+        let touch = touches(&frames);
+        // 29 mm is too far from either bottom, the middle beside the index is not the closest, but for 22 + 2 and more.
+        assert_eq!(touch.frames, [0, 10, 2 + 4, 0, 0]);
+        assert!((touch.distance[1] - 0.024).abs() < 1e-12, "{touch:?}");
+        // Never seen: of all together.
+        assert!(touch.distance[3] == touch.distance[4] && touch.distance[3] > 0.024, "{touch:?}");
+        assert_eq!(touches(&[frame([50.0, 60.0, 70.0, 80.0])]), Touch::default());
+        assert_eq!(touches(&[]), Touch::default());
     }
 }

@@ -7,7 +7,8 @@ use std::path::{Path, PathBuf};
 use std::rc::Rc;
 
 use anyhow::Context as _;
-use teleop_common::hand::HandSide;
+use teleop_common::hand::{HandModel, HandSide};
+use teleop_common::mapping::{MappingParams, Tuning, TuningUse};
 use teleop_common::master::{
     Calibration, Calibrator, Filter, FilterSettings, Fitter, Keypoints, MasterGeometry, MasterPose,
 };
@@ -22,6 +23,7 @@ pub(super) struct Frames {
     reader: RecordingReader<Counted>,
     read: Rc<Cell<u64>>,
     geometry: MasterGeometry,
+    tuning: Option<Tuning>,
     tracker: Option<Tracker>,
 }
 
@@ -63,32 +65,42 @@ impl Tracker {
 }
 
 impl Frames {
-    /// Opens `path`. If it holds keypoints and no calibration is given, measures the hand over the whole file first.
+    /// Opens `path`. If it holds keypoints and no calibration is given, measures the hand over the whole file first. A
+    /// person's hand is tuned for `hand`, unless its calibration says how.
     pub(super) fn open(
         path: &Path,
         calibration: Option<&Path>,
-        side: HandSide,
+        hand: &HandModel,
+        params: &MappingParams,
         filtered: bool,
     ) -> anyhow::Result<Self> {
-        let known = calibration.map(load_calibration).transpose()?;
+        let mut known = calibration.map(load_calibration).transpose()?;
         let (reader, read) = read(path)?;
         let mut geometry = reader.header().geometry.unwrap_or(MasterGeometry::PARADIGMATIC);
+        let mut tuning = reader.header().tuning;
         let mut tracker = None;
-        if let Some(known) = known {
-            geometry = known.geometry;
-            tracker = Some(Tracker::new(&known, filtered));
-        } else if matches!(first(path)?, Some(FrameData::Keypoints(_))) {
-            let measured = measure(path, side)?;
+        let keypoints = matches!(first(path)?, Some(FrameData::Keypoints(_)));
+        if known.is_none() && keypoints {
+            let measured = measure(path, hand.side)?;
             for line in measured.report() {
                 tracing::info!("{line}");
             }
-            geometry = measured.geometry;
-            tracker = Some(Tracker::new(&measured, filtered));
+            known = Some(measured);
+        }
+        if let Some(mut known) = known {
+            geometry = known.geometry;
+            tracker = Some(Tracker::new(&known, filtered));
+            if keypoints && params.tuning == TuningUse::Operator {
+                for line in known.tune(hand, params)? {
+                    tracing::info!("{line}");
+                }
+                tuning = known.tuning.map(|tuning| tuning.values);
+            }
         }
         if let Some(error) = geometry.validate().err() {
             return Err(UsageError(format!("{}: {error}", path.display())).into());
         }
-        Ok(Self { path: path.to_owned(), reader, read, geometry, tracker })
+        Ok(Self { path: path.to_owned(), reader, read, geometry, tuning, tracker })
     }
 }
 
@@ -102,11 +114,12 @@ impl Iterator for Frames {
         };
         let (pose, human) = match (&frame.data, &mut self.tracker) {
             (FrameData::Joints(q), _) => {
-                let pose = MasterPose { q: *q, geometry: self.geometry, tuning: None };
+                let pose = MasterPose { q: *q, geometry: self.geometry, tuning: self.tuning };
                 (pose, HumanTips::of_pose(&pose))
             }
             (FrameData::Keypoints(keypoints), Some(tracker)) => {
-                (tracker.pose(frame.t, keypoints), HumanTips::of_keypoints(keypoints, tracker.side))
+                let pose = MasterPose { tuning: self.tuning, ..tracker.pose(frame.t, keypoints) };
+                (pose, HumanTips::of_keypoints(keypoints, tracker.side))
             }
             (FrameData::Keypoints(_), None) => {
                 let (path, line) = (self.path.display(), self.reader.line());
