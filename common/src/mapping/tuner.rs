@@ -20,9 +20,10 @@ const MAX_RATIO: f64 = 1.25;
 /// tracker's noise.
 const R1: f64 = 0.020;
 const R1_MARGIN: f64 = 0.005;
-/// r2 looked at: the width of the transition, m. A wider one would move fingers that the person does not bring near the
-/// thumb.
+/// Widths of the transition looked at, m, and the largest r2 unless the narrowest needs more: the fingers of a relaxed
+/// hand are not much farther from its thumb, and are not to be moved.
 const WIDTHS: [f64; 4] = [0.030, 0.040, 0.050, 0.060];
+const MAX_R2: f64 = 0.080;
 /// Duration of a tap, s, that the robot should follow; the contacts of each finger tried; and the steps per second.
 const TAP: f64 = 2.0;
 const TAPS: usize = 5;
@@ -48,7 +49,7 @@ pub struct Tuned {
 /// c_s of the thumb's map is the largest at which 99 % of the contacts of every finger close, or the one that closes
 /// most; c_s of a finger the largest at which 99 % of its own do, at most a quarter above the thumb's. r1 is 5 mm beyond
 /// the contacts, r2 as close as taps of 2 s allow without exceeding the speed of the robot's joints (the transition
-/// multiplies the speed by up to `1 + pi D / (2 (r2 - r1))`, D the distance of the two targets), but at most 60 mm wider.
+/// multiplies the speed by up to `1 + pi D / (2 (r2 - r1))`, D the distance of the two targets), but not beyond 80 mm.
 /// Deterministic; takes a second or less.
 ///
 /// # Errors
@@ -104,7 +105,7 @@ pub fn tune(
     let mut tuning = Tuning { scale, r1, r2: r1, contact: *contact };
     let mut speed = f64::INFINITY;
     for width in WIDTHS {
-        tuning.r2 = r1 + width;
+        tuning.r2 = (r1 + width).min(MAX_R2.max(r1 + WIDTHS[0]));
         speed = tap_speed(&mut retargeter, &tuning, &samples);
         if speed <= 1.0 {
             break;
@@ -170,7 +171,10 @@ impl Tuned {
                 r2 * 1e3,
                 list(&millimetres),
             ),
-            format!("a tap of {TAP} s takes {:.0} % of the joints' speed at the most (median)", self.speed * 100.0),
+            format!(
+                "a tap of {TAP} s takes at most {:.0} % of the joints' speed (median over taps)",
+                self.speed * 100.0
+            ),
             format!("share of the person's contacts that close, by scale: {}", list(&|f| f.name().to_owned())),
         ];
         for (scale, shares) in self.coverage.iter().step_by(2) {
