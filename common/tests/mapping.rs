@@ -7,7 +7,7 @@ use proptest::prelude::*;
 use teleop_common::hand::{Finger, HandModel, HandSide};
 use teleop_common::ik::IkStatus;
 use teleop_common::mapping::{
-    Anchor, CartesianMap, MappingMode, MappingOutput, MappingParams, Pinned, Retargeter, Tuning, TuningUse,
+    Anchor, CartesianMap, MappingMode, MappingOutput, MappingParams, Pinned, Retargeter, ThumbMap, Tuning, TuningUse,
 };
 use teleop_common::master::{Gesture, MasterGeometry, MasterPose};
 
@@ -336,8 +336,10 @@ fn what_a_pose_says_about_its_operator_holds_but_for_what_is_pinned_or_fixed() {
 
 #[test]
 fn a_tuning_that_says_what_the_robot_says_changes_no_bit() {
-    let mut plain = retargeter(MappingParams::default());
-    let mut tuned = retargeter(MappingParams::default());
+    // But for the thumb of a tracked person, which is mapped otherwise.
+    let params = || MappingParams { thumb_map: ThumbMap::Angles, ..MappingParams::default() };
+    let mut plain = retargeter(params());
+    let mut tuned = retargeter(params());
     let own = MappingParams::default().tuned(None);
     for tick in 0..3000 {
         let pose = pose(Gesture::Tour.sample(f64::from(tick) * 0.02));

@@ -1,6 +1,8 @@
 use nalgebra::{Matrix3, Vector3, Vector4};
 
-use super::{Anchor, CartesianMap, MappingMode, MappingParams, ParamError, Pinned, Retargeter, Tuning, TuningUse};
+use super::{
+    Anchor, CartesianMap, MappingMode, MappingParams, ParamError, Pinned, Retargeter, ThumbMap, Tuning, TuningUse,
+};
 use crate::hand::{Finger, FingerChain, HandModel, JointMap, MAX_FINGERS, TipFrame};
 use crate::ik::{FingerIk, POSTURE_WEIGHT_MIN};
 use crate::master::{JOINT_LIMITS, MasterGeometry, MasterPose, OPEN, minimum_jerk};
@@ -61,8 +63,14 @@ pub fn tune(
     contact: &[f64; MAX_FINGERS],
 ) -> Result<Tuned, ParamError> {
     // The tuning that is being made is to hold, whatever the robot will do with it.
-    let (mode, pinned) = (MappingMode::Combined, Pinned::default());
-    let params = MappingParams { mode, tuning: TuningUse::Operator, pinned, ..params.clone() };
+    // The thumb by angles, because it is the transition that is judged, not what the thumb does before.
+    let params = MappingParams {
+        mode: MappingMode::Combined,
+        thumb_map: ThumbMap::Angles,
+        tuning: TuningUse::Operator,
+        pinned: Pinned::default(),
+        ..params.clone()
+    };
     let mut retargeter = Retargeter::new(hand.clone(), params)?;
     let joint_map = retargeter.joint_map().clone();
     let judge = Judge::new(hand, &joint_map);

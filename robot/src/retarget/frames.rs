@@ -90,9 +90,11 @@ impl Frames {
         if let Some(mut known) = known {
             geometry = known.geometry;
             tracker = Some(Tracker::new(&known, filtered));
-            if keypoints && params.tuning == TuningUse::Operator {
-                for line in known.tune(hand, params)? {
-                    tracing::info!("{line}");
+            if keypoints {
+                let reasons = known.tune(hand, params)?;
+                // Also where the values do not hold: that there are any says that this is a tracked person.
+                if params.tuning == TuningUse::Operator {
+                    reasons.iter().for_each(|line| tracing::info!("{line}"));
                 }
                 tuning = known.tuning.map(|tuning| tuning.values);
             }
