@@ -147,8 +147,9 @@ fn fig2_keeps_its_contract() {
             let value = |index: usize| if signed { values[index] } else { values[index].abs() };
             let by = |a: &usize, b: &usize| values[*a].abs().total_cmp(&values[*b].abs());
             let (largest, smallest) = ((0..455).max_by(by).unwrap(), (0..455).min_by(by).unwrap());
-            assert_eq!(extremes["max"].as_f64().unwrap(), value(largest));
-            assert_eq!(extremes["min"].as_f64().unwrap(), value(smallest));
+            // A JSON parser is exact for numbers of few digits, not for all.
+            assert!((extremes["max"].as_f64().unwrap() - value(largest)).abs() < 1e-9);
+            assert!((extremes["min"].as_f64().unwrap() - value(smallest)).abs() < 1e-9);
             assert_eq!(extremes["max_at"], serde_json::json!(at(largest)));
             assert_eq!(extremes["min_at"], serde_json::json!(at(smallest)));
             let mean = values.iter().map(|value| value.abs()).sum::<f64>() / 455.0;

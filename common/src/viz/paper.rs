@@ -165,7 +165,8 @@ fn motion(run: &PaperRun<'_>, hand: &HandModel, stream: &RecordingStream) -> Rec
 fn signals(run: &PaperRun<'_>, stream: &RecordingStream) -> RecordingStreamResult<()> {
     let Some(first) = run.samples.first() else { return Ok(()) };
     let fingers: Vec<Finger> = first.output.fingers().iter().map(|signals| signals.finger).collect();
-    let curves: [(&str, fn(&FingerSignals) -> f64); 4] = [
+    type Signal = (&'static str, fn(&FingerSignals) -> f64);
+    let curves: [Signal; 4] = [
         ("k", |signals| signals.k),
         ("e_Q", |signals| signals.e_q),
         ("e_C", |signals| signals.e_c * 1e3),
