@@ -21,6 +21,7 @@ pub struct Retargeter {
     gain: Gain,
     solvers: Vec<FingerIk>,
     thumb_shape: Option<ThumbShape>,
+    last_shape: Option<[f64; MAX_FINGER_JOINTS]>,
     // Last solution per finger, and of the thumb's projection.
     last: [Option<[f64; MAX_FINGER_JOINTS]>; MAX_FINGERS],
     last_anchor: Option<[f64; MAX_FINGER_JOINTS]>,
@@ -44,6 +45,7 @@ impl Retargeter {
             gain: Gain { r1: params.r1, r2: params.r2, shape: params.gain },
             solvers: hand.fingers.iter().map(|chain| FingerIk::new(chain, &hand.joints)).collect(),
             thumb_shape: ThumbShape::new(&hand),
+            last_shape: None,
             baseline: Baseline::new(&hand, params.mode, params.baseline),
             hand,
             params,
@@ -74,6 +76,7 @@ impl Retargeter {
     pub fn reset(&mut self) {
         self.last = [None; MAX_FINGERS];
         self.last_anchor = None;
+        self.last_shape = None;
         if let Some(baseline) = &mut self.baseline {
             baseline.reset();
         }
@@ -127,7 +130,7 @@ impl Retargeter {
     }
 
     /// Clipped M_Q(q), rad.
-    fn joint(&self, pose: &MasterPose) -> JointVector {
+    fn joint(&mut self, pose: &MasterPose) -> JointVector {
         let mut q = self.hand.clip(&self.joint_map.apply(&pose.q));
         let by_directions = match self.params.thumb_map {
             ThumbMap::Auto => pose.tuning.is_some(),
@@ -136,7 +139,10 @@ impl Retargeter {
         };
         let thumb = self.hand.fingers.iter().find(|chain| chain.finger == Finger::Thumb);
         if let (true, Some(chain), Some(shape)) = (by_directions, thumb, &self.thumb_shape) {
-            chain.scatter(&shape.solve(chain, &self.hand.anatomical_from_palm.transpose(), pose), &mut q);
+            let palm_from_anatomical = self.hand.anatomical_from_palm.transpose();
+            let own = shape.solve(chain, &palm_from_anatomical, pose, self.last_shape.as_ref());
+            self.last_shape = Some(own);
+            chain.scatter(&own, &mut q);
         }
         q
     }

@@ -14,6 +14,10 @@ const REST: f64 = 0.1;
 const LOOK: usize = 4;
 /// Steps of the descent from there.
 const ITERATIONS: usize = 20;
+/// A posture this good (weighted squares of unit vectors: a dozen degrees) is not compared with others.
+const GOOD: f64 = 0.05;
+/// By how much another valley must be better to be gone to: some 20 degrees of one bone.
+const LEAVE: f64 = 0.12;
 /// How far apart two postures are to be in two valleys, rad.
 const APART: f64 = 0.8;
 /// Longest step of a joint, rad.
@@ -72,19 +76,33 @@ impl ThumbShape {
     }
 
     /// The thumb's joint angles (rad, palm outwards) for the human's pose.
+    ///
+    /// From `last`, the posture before this one in a motion, the thumb stays in its valley until another is clearly
+    /// deeper: two postures as good as each other must not take turns.
     pub(super) fn solve(
         &self,
         chain: &FingerChain,
         palm_from_anatomical: &Matrix3<f64>,
         pose: &MasterPose,
+        last: Option<&[f64; N]>,
     ) -> [f64; N] {
         let wanted = wanted(palm_from_anatomical, pose);
+        let kept = last.map(|last| self.descend(chain, &wanted, SVector::from(*last), ITERATIONS));
+        if let Some((cost, q)) = kept
+            && cost < GOOD
+        {
+            return q.into();
+        }
         // The two best valleys; the cost of the first few steps tells which is the deeper one.
         let first = self.seed(&wanted, None);
         let second = self.seed(&wanted, Some(&first));
         let [first, second] = [first, second].map(|seed| self.descend(chain, &wanted, seed, LOOK));
         let (_, q) = if second.0 < first.0 { second } else { first };
-        self.descend(chain, &wanted, q, ITERATIONS).1.into()
+        let (cost, q) = self.descend(chain, &wanted, q, ITERATIONS);
+        match kept {
+            Some((own, kept)) if own < cost + LEAVE => kept.into(),
+            _ => q.into(),
+        }
     }
 
     /// The best posture to begin at, away from `other`.
@@ -232,7 +250,7 @@ mod tests {
             for _ in 0..300 {
                 let pose = random_pose(&mut state);
                 let wanted = wanted(&palm, &pose);
-                let q = SVector::from(shape.solve(chain, &palm, &pose));
+                let q = SVector::from(shape.solve(chain, &palm, &pose, None));
                 let cost = |q: &SVector<f64, N>| shape.cost(&wanted, &bones(chain, q).0, q);
                 let found = cost(&q);
                 // A random search that narrows down.
@@ -259,6 +277,33 @@ mod tests {
     }
 
     #[test]
+    fn along_a_motion_the_thumb_does_not_leap_to_and_fro() {
+        let hand = HandModel::allegro_v4(HandSide::Right);
+        let (chain, shape) = (&hand.fingers[0], ThumbShape::new(&hand).unwrap());
+        let palm = hand.anatomical_from_palm.transpose();
+        let leaps = |history: bool| {
+            let (mut state, mut leaps, mut last) = (3, 0, None::<[f64; N]>);
+            for _ in 0..50 {
+                let [from, to] = [random_pose(&mut state), random_pose(&mut state)];
+                for step in 0..200 {
+                    let mut pose = from;
+                    for (angle, end) in pose.q.iter_mut().zip(&to.q) {
+                        *angle += (end - *angle) * f64::from(step) / 200.0;
+                    }
+                    let q = shape.solve(chain, &palm, &pose, last.as_ref().filter(|_| history && step > 0));
+                    if let (Some(last), true) = (last.replace(q), step > 0) {
+                        leaps += usize::from((SVector::<f64, N>::from(q) - SVector::from(last)).amax() > 0.2);
+                    }
+                }
+            }
+            leaps
+        };
+        // A way across the whole range may need one; with no history there are more.
+        let (with, without) = (leaps(true), leaps(false));
+        assert!(4 * with < 3 * without, "{with} leaps on 50 ways, {without} without history");
+    }
+
+    #[test]
     fn small_moves_of_the_human_are_small_moves_of_the_robot() {
         let hand = HandModel::allegro_v4(HandSide::Right);
         let shape = ThumbShape::new(&hand).unwrap();
@@ -269,7 +314,7 @@ mod tests {
                 let pose = random_pose(&mut state);
                 let mut near = pose;
                 near.q[..4].iter_mut().for_each(|angle| *angle += 1e-3 * (random(&mut state) - 0.5));
-                let solve = |pose| SVector::from(shape.solve(&hand.fingers[0], &palm, pose));
+                let solve = |pose| SVector::from(shape.solve(&hand.fingers[0], &palm, pose, None));
                 (solve(&near) - solve(&pose)).amax()
             })
             .collect();
