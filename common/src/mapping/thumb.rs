@@ -1,9 +1,12 @@
 use nalgebra::{Matrix3, SMatrix, SVector, Vector3};
 
-use crate::hand::{Finger, FingerChain, HandModel, MAX_FINGER_JOINTS};
+use crate::hand::{Finger, FingerChain, HandModel, Joint, MAX_FINGER_JOINTS};
 use crate::master::MasterPose;
 
-const N: usize = MAX_FINGER_JOINTS;
+/// Postures to begin at: so many shares of every joint's range.
+const SHARES: [f64; 3] = [0.1, 0.5, 0.9];
+const MAX_SEEDS: usize = SHARES.len().pow(MAX_FINGER_JOINTS as u32);
+
 type Bones = [Vector3<f64>; 3];
 
 /// Weights of metacarpal, proximal and distal phalanx: the last two are what a person sees and touches with.
@@ -40,39 +43,22 @@ const SETTLED: f64 = 1e-5;
 /// phalanx. The robot's are the lines from the first joint to the last but one, from there to the last, and from there
 /// to the pole.
 #[derive(Clone, Debug)]
-pub(super) struct ThumbShape {
-    lower: SVector<f64, N>,
-    upper: SVector<f64, N>,
-    rest: SVector<f64, N>,
-    // Postures over the joint box, with their bones: where to begin.
-    seeds: Vec<(SVector<f64, N>, Bones)>,
+pub(super) enum ThumbShape {
+    Three(Shape<3>),
+    Four(Shape<4>),
+    Five(Shape<5>),
 }
 
 impl ThumbShape {
     /// For the thumb of `hand`; `None` if it has fewer than three joints, and so no bones to compare.
     pub(super) fn new(hand: &HandModel) -> Option<Self> {
         let chain = hand.fingers.iter().find(|chain| chain.finger == Finger::Thumb)?;
-        let count = chain.joints.len();
-        if count < 3 {
-            return None;
-        }
-        let own = |value: fn(&crate::hand::Joint) -> f64| {
-            let mut out = SVector::<f64, N>::zeros();
-            chain.joints.iter().enumerate().for_each(|(slot, joint)| out[slot] = value(&hand.joints[joint.joint]));
-            out
-        };
-        let (lower, upper) = (own(|joint| joint.lower), own(|joint| joint.upper));
-        let shares = [0.1, 0.5, 0.9];
-        let seeds = (0..shares.len().pow(count as u32)).map(|index| {
-            let mut rest = index;
-            let mut q = SVector::<f64, N>::zeros();
-            for slot in 0..count {
-                q[slot] = lower[slot] + (upper[slot] - lower[slot]) * shares[rest % shares.len()];
-                rest /= shares.len();
-            }
-            (q, bones(chain, &q).0)
-        });
-        Some(Self { lower, upper, rest: own(|joint| joint.home), seeds: seeds.collect() })
+        Some(match chain.joints.len() {
+            3 => Self::Three(Shape::new(hand, chain)),
+            4 => Self::Four(Shape::new(hand, chain)),
+            5 => Self::Five(Shape::new(hand, chain)),
+            _ => return None,
+        })
     }
 
     /// The thumb's joint angles (rad, palm outwards) for the human's pose.
@@ -84,37 +70,90 @@ impl ThumbShape {
         chain: &FingerChain,
         palm_from_anatomical: &Matrix3<f64>,
         pose: &MasterPose,
-        last: Option<&[f64; N]>,
-    ) -> [f64; N] {
+        last: Option<&[f64; MAX_FINGER_JOINTS]>,
+    ) -> [f64; MAX_FINGER_JOINTS] {
         let wanted = wanted(palm_from_anatomical, pose);
-        let kept = last.map(|last| self.descend(chain, &wanted, SVector::from(*last), ITERATIONS));
+        let mut out = [0.0; MAX_FINGER_JOINTS];
+        match self {
+            Self::Three(shape) => out[..3].copy_from_slice(shape.solve(chain, &wanted, last).as_slice()),
+            Self::Four(shape) => out[..4].copy_from_slice(shape.solve(chain, &wanted, last).as_slice()),
+            Self::Five(shape) => out.copy_from_slice(shape.solve(chain, &wanted, last).as_slice()),
+        }
+        out
+    }
+}
+
+/// The same for a thumb of C joints.
+#[derive(Clone, Debug)]
+pub(super) struct Shape<const C: usize> {
+    lower: SVector<f64, C>,
+    upper: SVector<f64, C>,
+    rest: SVector<f64, C>,
+    seeds: Vec<Seed<C>>,
+}
+
+/// A posture to begin at. What it costs is `constant - sum_b slopes_b d_b`, as all bones are unit vectors.
+#[derive(Clone, Debug)]
+struct Seed<const C: usize> {
+    q: SVector<f64, C>,
+    constant: f64,
+    slopes: Bones,
+}
+
+impl<const C: usize> Shape<C> {
+    fn new(hand: &HandModel, chain: &FingerChain) -> Self {
+        let own = |value: fn(&Joint) -> f64| {
+            SVector::<f64, C>::from_fn(|slot, _| value(&hand.joints[chain.joints[slot].joint]))
+        };
+        let (lower, upper, rest) = (own(|joint| joint.lower), own(|joint| joint.upper), own(|joint| joint.home));
+        let mut shape = Self { lower, upper, rest, seeds: Vec::new() };
+        shape.seeds = (0..SHARES.len().pow(C as u32))
+            .map(|index| {
+                let share = |slot| SHARES[index / SHARES.len().pow(slot as u32) % SHARES.len()];
+                let q = SVector::from_fn(|slot, _| lower[slot] + (upper[slot] - lower[slot]) * share(slot));
+                let bones = bones(chain, &q).0;
+                let slopes = std::array::from_fn(|bone| bones[bone] * (2.0 * WEIGHTS[bone] * WEIGHTS[bone]));
+                // It costs nothing but the posture if the human's bones are the very same.
+                Seed { q, constant: shape.cost(&bones, &bones, &q) + slope_sum(&slopes, &bones), slopes }
+            })
+            .collect();
+        shape
+    }
+
+    fn solve(&self, chain: &FingerChain, wanted: &Bones, last: Option<&[f64; MAX_FINGER_JOINTS]>) -> SVector<f64, C> {
+        let kept = last.map(|last| self.descend(chain, wanted, SVector::from_fn(|slot, _| last[slot]), ITERATIONS));
         if let Some((cost, q)) = kept
             && cost < GOOD
         {
-            return q.into();
+            return q;
         }
         // The two best valleys; the cost of the first few steps tells which is the deeper one.
-        let first = self.seed(&wanted, None);
-        let second = self.seed(&wanted, Some(&first));
-        let [first, second] = [first, second].map(|seed| self.descend(chain, &wanted, seed, LOOK));
+        let [first, second] = self.starts(wanted).map(|start| self.descend(chain, wanted, start, LOOK));
         let (_, q) = if second.0 < first.0 { second } else { first };
-        let (cost, q) = self.descend(chain, &wanted, q, ITERATIONS);
+        let (cost, q) = self.descend(chain, wanted, q, ITERATIONS);
         match kept {
-            Some((own, kept)) if own < cost + LEAVE => kept.into(),
-            _ => q.into(),
+            Some((own, kept)) if own < cost + LEAVE => kept,
+            _ => q,
         }
     }
 
-    /// The best posture to begin at, away from `other`.
-    fn seed(&self, wanted: &Bones, other: Option<&SVector<f64, N>>) -> SVector<f64, N> {
-        let mut best = (f64::INFINITY, self.rest);
-        for (q, bones) in &self.seeds {
-            let cost = self.cost(wanted, bones, q);
-            if cost < best.0 && other.is_none_or(|other| (q - other).amax() > APART) {
-                best = (cost, *q);
+    /// The best posture to begin at, and the best away from that.
+    fn starts(&self, wanted: &Bones) -> [SVector<f64, C>; 2] {
+        let mut costs = [0.0; MAX_SEEDS];
+        let mut first = (f64::INFINITY, self.rest);
+        for (cost, seed) in costs.iter_mut().zip(&self.seeds) {
+            *cost = seed.constant - slope_sum(&seed.slopes, wanted);
+            if *cost < first.0 {
+                first = (*cost, seed.q);
             }
         }
-        best.1
+        let mut second = (f64::INFINITY, self.rest);
+        for (&cost, seed) in costs.iter().zip(&self.seeds) {
+            if cost < second.0 && (seed.q - first.1).amax() > APART {
+                second = (cost, seed.q);
+            }
+        }
+        [first.1, second.1]
     }
 
     /// Levenberg-Marquardt with the joints at their ends held.
@@ -122,21 +161,21 @@ impl ThumbShape {
         &self,
         chain: &FingerChain,
         wanted: &Bones,
-        mut q: SVector<f64, N>,
+        mut q: SVector<f64, C>,
         iterations: usize,
-    ) -> (f64, SVector<f64, N>) {
+    ) -> (f64, SVector<f64, C>) {
         let (mut now, mut slopes) = bones(chain, &q);
         let mut value = self.cost(wanted, &now, &q);
         let mut damping = 0.0;
         for _ in 0..iterations {
             let mut gradient = (q - self.rest) * (REST * REST);
-            let mut hessian = SMatrix::<f64, N, N>::identity() * (REST * REST + damping);
+            let mut hessian = SMatrix::<f64, C, C>::identity() * (REST * REST + damping);
             for bone in 0..3 {
                 let weight = WEIGHTS[bone] * WEIGHTS[bone];
                 gradient += slopes[bone].tr_mul(&(now[bone] - wanted[bone])) * weight;
                 hessian += slopes[bone].tr_mul(&slopes[bone]) * weight;
             }
-            for slot in 0..N {
+            for slot in 0..C {
                 let held = (q[slot] <= self.lower[slot] && gradient[slot] > 0.0)
                     || (q[slot] >= self.upper[slot] && gradient[slot] < 0.0);
                 if held {
@@ -166,7 +205,7 @@ impl ThumbShape {
         (value, q)
     }
 
-    fn cost(&self, wanted: &Bones, bones: &Bones, q: &SVector<f64, N>) -> f64 {
+    fn cost(&self, wanted: &Bones, bones: &Bones, q: &SVector<f64, C>) -> f64 {
         let shape: f64 = (0..3).map(|bone| (WEIGHTS[bone] * (bones[bone] - wanted[bone])).norm_squared()).sum();
         shape + REST * REST * (q - self.rest).norm_squared()
     }
@@ -178,11 +217,14 @@ fn wanted(palm_from_anatomical: &Matrix3<f64>, pose: &MasterPose) -> Bones {
     [second - base, third - second, tip - third].map(|bone| palm_from_anatomical * bone.normalize())
 }
 
+fn slope_sum(slopes: &Bones, bones: &Bones) -> f64 {
+    slopes.iter().zip(bones).map(|(slope, bone)| slope.dot(bone)).sum()
+}
+
 /// Unit vectors along the three bones in the palm frame, and their derivatives by the joints.
-fn bones(chain: &FingerChain, q: &SVector<f64, N>) -> (Bones, [SMatrix<f64, 3, N>; 3]) {
-    let count = chain.joints.len();
+fn bones<const C: usize>(chain: &FingerChain, q: &SVector<f64, C>) -> (Bones, [SMatrix<f64, 3, C>; 3]) {
     let (mut position, mut rotation) = (Vector3::zeros(), Matrix3::identity());
-    let (mut origins, mut axes) = ([Vector3::<f64>::zeros(); N], [Vector3::zeros(); N]);
+    let (mut origins, mut axes) = ([Vector3::<f64>::zeros(); C], [Vector3::zeros(); C]);
     for (slot, joint) in chain.joints.iter().enumerate() {
         position += rotation * joint.translation;
         rotation *= joint.rotation_at(q[slot]);
@@ -190,19 +232,19 @@ fn bones(chain: &FingerChain, q: &SVector<f64, N>) -> (Bones, [SMatrix<f64, 3, N
         axes[slot] = rotation * joint.axis;
     }
     let pole = position + rotation * chain.pole;
-    let (knuckle, last) = (origins[count - 2], origins[count - 1]);
+    let (knuckle, last) = (origins[C - 2], origins[C - 1]);
     // A bone's ends, and how many joints move it as a whole.
-    let ends = [(origins[0], knuckle, 0), (knuckle, last, count - 1), (last, pole, count)];
-    let mut out = ([Vector3::zeros(); 3], [SMatrix::<f64, 3, N>::zeros(); 3]);
+    let ends = [(origins[0], knuckle, 0), (knuckle, last, C - 1), (last, pole, C)];
+    let mut out = ([Vector3::zeros(); 3], [SMatrix::<f64, 3, C>::zeros(); 3]);
     for (bone, (from, to, rigid)) in ends.into_iter().enumerate() {
         let vector = to - from;
         let length = vector.norm().max(1e-9);
         let unit = vector / length;
         out.0[bone] = unit;
-        for slot in 0..count {
+        for slot in 0..C {
             let slope = if slot < rigid {
                 axes[slot].cross(&unit)
-            } else if bone == 0 && slot < count - 2 {
+            } else if bone == 0 && slot < C - 2 {
                 // The metacarpal has joints inside.
                 let slope = axes[slot].cross(&(to - origins[slot])) / length;
                 slope - unit * unit.dot(&slope)
@@ -244,20 +286,20 @@ mod tests {
         for side in [HandSide::Right, HandSide::Left] {
             let hand = HandModel::allegro_v4(side);
             let chain = &hand.fingers[0];
-            let shape = ThumbShape::new(&hand).unwrap();
+            let Some(ThumbShape::Four(shape)) = ThumbShape::new(&hand) else { panic!("four joints") };
             let palm = hand.anatomical_from_palm.transpose();
             let (mut worse, mut worst) = (0, 0.0_f64);
             for _ in 0..300 {
                 let pose = random_pose(&mut state);
                 let wanted = wanted(&palm, &pose);
-                let q = SVector::from(shape.solve(chain, &palm, &pose, None));
-                let cost = |q: &SVector<f64, N>| shape.cost(&wanted, &bones(chain, q).0, q);
+                let q = shape.solve(chain, &wanted, None);
+                let cost = |q: &SVector<f64, 4>| shape.cost(&wanted, &bones(chain, q).0, q);
                 let found = cost(&q);
                 // A random search that narrows down.
                 let (mut best, mut best_q) = (f64::INFINITY, q);
                 for round in 0..3000 {
                     let width = if round < 1000 { 1.0 } else { 0.2 * 0.997_f64.powi(round - 1000) };
-                    let mut other = SVector::<f64, N>::zeros();
+                    let mut other = SVector::<f64, 4>::zeros();
                     for slot in 0..4 {
                         let (lower, upper) = (shape.lower[slot], shape.upper[slot]);
                         let around = if round < 1000 { 0.5 * (lower + upper) } else { best_q[slot] };
@@ -282,7 +324,7 @@ mod tests {
         let (chain, shape) = (&hand.fingers[0], ThumbShape::new(&hand).unwrap());
         let palm = hand.anatomical_from_palm.transpose();
         let leaps = |history: bool| {
-            let (mut state, mut leaps, mut last) = (3, 0, None::<[f64; N]>);
+            let (mut state, mut leaps, mut last) = (3, 0, None::<[f64; MAX_FINGER_JOINTS]>);
             for _ in 0..50 {
                 let [from, to] = [random_pose(&mut state), random_pose(&mut state)];
                 for step in 0..200 {
@@ -292,7 +334,9 @@ mod tests {
                     }
                     let q = shape.solve(chain, &palm, &pose, last.as_ref().filter(|_| history && step > 0));
                     if let (Some(last), true) = (last.replace(q), step > 0) {
-                        leaps += usize::from((SVector::<f64, N>::from(q) - SVector::from(last)).amax() > 0.2);
+                        leaps += usize::from(
+                            (SVector::<f64, MAX_FINGER_JOINTS>::from(q) - SVector::from(last)).amax() > 0.2,
+                        );
                     }
                 }
             }
