@@ -209,7 +209,7 @@ pub(super) fn fig8_csv(hand: &HandModel, samples: &[Sample]) -> String {
         let scalars = SCALARS.iter().flat_map(|(_, _, value)| fingers.iter().map(value));
         let vectors = VECTORS.iter().flat_map(|(_, value)| {
             let turned = fingers.iter().map(|signals| hand.anatomical_from_palm * value(signals) * MM);
-            turned.flat_map(|p| <[f64; 3]>::from(p))
+            turned.flat_map(<[f64; 3]>::from)
         });
         row(&mut out, [round(sample.t)].into_iter().chain(scalars).chain(vectors));
     }
