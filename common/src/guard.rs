@@ -26,10 +26,19 @@ const POSTURE_WEIGHT: f64 = 3e-3;
 const PLACE_WEIGHT: f64 = 0.2;
 /// Linearisations at most.
 const ITERATIONS: usize = 10;
-/// Times that joints are found to be at their end in each.
+/// Times that joints are found to be at their end in each linearisation.
 const MAX_HELD: usize = 3;
+/// Sweeps over the pairs in each linearisation.
+const SWEEPS: usize = 8;
 /// Pairs with a gap below this are watched, m.
 const NEAR: f64 = 0.01;
+/// Largest move of a joint in one linearisation, rad.
+const MAX_STEP: f64 = 0.15;
+/// Overlap this much smaller than asked for is as good, m.
+const TOLERANCE: f64 = 2e-5;
+/// Below this step (rad) the posture has settled.
+const SETTLED: f64 = 1e-3;
+
 /// Sweeps over the pairs when slowing.
 const SLOW_SWEEPS: usize = 6;
 /// Room between two fingertips from which on nobody has to brake, m.
@@ -38,14 +47,6 @@ const BRAKING: f64 = 0.06;
 const SLACK: f64 = 0.0003;
 /// How fast an overlap is undone, 1/s.
 const PUSH: f64 = 20.0;
-/// Sweeps over the pairs in each.
-const SWEEPS: usize = 8;
-/// Largest move of a joint in one linearisation, rad.
-const MAX_STEP: f64 = 0.15;
-/// Overlap this much smaller than asked for is as good, m.
-const TOLERANCE: f64 = 2e-5;
-/// Below this step (rad) the posture has settled.
-const SETTLED: f64 = 1e-3;
 
 /// The guard of one hand.
 #[derive(Clone, Debug)]
@@ -139,8 +140,8 @@ impl TipGuard {
     /// overlap too much apart: the change of `velocity` (rad/s, wire order) at posture `q` that is least in the squares.
     ///
     /// Postures far apart may have fingertips in each other's way; this guards the way from one to the other. Each
-    /// joint stays between `low` and `high` (rad/s), which is what the joint can do in the next tick, `period` seconds;
-    /// `acceleration` (rad/s²) is what it can change each second. `movable` as in [`TipGuard::apart`].
+    /// joint stays between `low` and `high` (rad/s), which is what it can do in the next tick, `period` seconds. `movable`
+    /// is as in [`TipGuard::apart`]. Does not allocate; bounded work.
     pub fn slow(
         &self,
         hand: &HandModel,

@@ -148,12 +148,6 @@ impl Controller {
         self.retargeter.hand()
     }
 
-    /// The mapping parameters in force.
-    #[must_use]
-    pub fn mapping_params(&self) -> &MappingParams {
-        self.retargeter.params()
-    }
-
     /// The last tick's mode.
     #[must_use]
     pub fn mode(&self) -> Mode {
