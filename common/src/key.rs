@@ -49,6 +49,12 @@ impl Keys {
         self.key("cmd/pose")
     }
 
+    /// Stops and resets, anybody to robot: [`crate::wire::ControlMessage`].
+    #[must_use]
+    pub fn control(&self) -> String {
+        self.key("cmd/control")
+    }
+
     /// Joint state, robot to all: [`crate::wire::JointStateMessage`].
     #[must_use]
     pub fn joints(&self) -> String {
@@ -79,6 +85,12 @@ impl Keys {
         self.key("in/hand")
     }
 
+    /// The operator's clutch in JSON from any other program (a pedal, a button), for the operator.
+    #[must_use]
+    pub fn clutch_input(&self) -> String {
+        self.key("in/clutch")
+    }
+
     /// Liveliness token of a robot process.
     #[must_use]
     pub fn live_robot(&self, epoch: u64) -> String {
@@ -89,6 +101,20 @@ impl Keys {
     #[must_use]
     pub fn live_operator(&self, epoch: u64) -> String {
         self.key(&format!("live/operator/{epoch:016x}"))
+    }
+
+    /// All robot processes of any name that are alive.
+    #[must_use]
+    pub fn all_live_robots() -> String {
+        format!("{ROOT}/*/live/robot/*")
+    }
+
+    /// The keys of the robot whose liveliness key this is.
+    #[must_use]
+    pub fn of_live_robot(key: &str) -> Option<Self> {
+        let name = key.strip_prefix(ROOT)?.strip_prefix('/')?.split('/').next()?;
+        let keys = Self::new(name).ok()?;
+        (keys.live_epoch(key).is_some() && key.contains("/live/robot/")).then_some(keys)
     }
 
     /// All robot processes of this name that are alive.
@@ -144,6 +170,9 @@ mod tests {
         assert_eq!(keys.live_robot(0xab), "allegro/v1/allegro/live/robot/00000000000000ab");
         assert_eq!(keys.live_epoch(&keys.live_robot(0xab)), Some(0xab));
         assert_eq!(keys.live_epoch(&keys.live_operator(u64::MAX)), Some(u64::MAX));
+        assert_eq!(Keys::of_live_robot(&keys.live_robot(0xab)), Some(keys.clone()));
+        assert_eq!(Keys::of_live_robot(&keys.live_operator(0xab)), None);
+        assert_eq!(Keys::of_live_robot("allegro/v1/A*/live/robot/00000000000000ab"), None);
         assert_eq!(keys.live_epoch("allegro/v1/other/live/robot/00000000000000ab"), None);
         assert_eq!(keys.live_epoch("allegro/v1/allegro/live/robot/+0000000000000ab"), None);
     }

@@ -6,6 +6,7 @@
 //!
 //! | module | one line |
 //! |---|---|
+//! | [`authority`] | who moves the robot, and when: lease, clutch, watchdog, stop |
 //! | [`hand`] | the robot hand: URDF + description to a flat [`hand::HandModel`], forward kinematics, Jacobians |
 //! | [`master`] | the human hand: the paradigmatic 20-joint model, keypoint fit, calibration, gestures |
 //! | [`mapping`] | the combined joint-Cartesian mapping, Eq. 1-14 |
@@ -15,11 +16,13 @@
 //! | [`mode`] | what the robot is doing |
 //! | [`key`] | key expressions of a robot |
 //! | [`wire`] | the binary messages and their one codec door |
+//! | [`playout`] | poses that arrive unevenly, played evenly |
 //! | [`quality`] | how well the robot followed a recorded hand, in figures |
 //! | [`recording`] | recordings of a human hand, line by line: CSV of keypoints, JSON lines |
 //! | [`time`] | monotonic time as a number, clock offset, latency histogram |
 //! | [`testing`] | where tests find recordings |
 
+pub mod authority;
 pub mod guard;
 pub mod hand;
 pub mod ik;
@@ -30,6 +33,7 @@ pub mod mode;
 #[cfg(feature = "net")]
 pub mod net;
 pub mod paper;
+pub mod playout;
 pub mod quality;
 pub mod recording;
 pub mod testing;

@@ -1,23 +1,40 @@
-//! What the robot is doing, as both ends call it.
+//! What the robot is doing, as both ends call it. How it gets from one mode to another: [`crate::authority`].
 
 /// The robot's mode.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
 #[repr(u8)]
 pub enum Mode {
-    /// Running, no operator seen yet: the hand holds where it was found.
+    /// No operator has the robot: the hand holds where it is.
     #[default]
-    Idle = 0,
+    Disarmed = 0,
+    /// An operator has the robot and its poses are good; its clutch is open and the hand holds.
+    Armed = 1,
+    /// The clutch was closed: the hand moves to the operator's posture, slowly at first.
+    Engaging = 2,
     /// Following the operator's poses.
-    Engaged = 1,
-    /// Poses stopped, came too late or were not valid: the hand holds its last posture until they are good again.
-    Holding = 2,
+    Engaged = 3,
+    /// Poses stopped or were not usable while the hand followed: it holds until the clutch is closed again.
+    Holding = 4,
+    /// Holding went on for long: the hand does what was configured for that (holds, gives way, opens or lets go).
+    Relaxed = 5,
+    /// Somebody pressed stop: nothing moves until the stop is reset.
+    Stopped = 6,
     /// The hand or the process failed; only a restart ends it.
-    Faulted = 3,
+    Faulted = 7,
 }
 
 impl Mode {
     /// All modes, by wire value.
-    pub const ALL: [Self; 4] = [Self::Idle, Self::Engaged, Self::Holding, Self::Faulted];
+    pub const ALL: [Self; 8] = [
+        Self::Disarmed,
+        Self::Armed,
+        Self::Engaging,
+        Self::Engaged,
+        Self::Holding,
+        Self::Relaxed,
+        Self::Stopped,
+        Self::Faulted,
+    ];
 
     /// The mode with this number on the wire.
     #[must_use]
@@ -31,13 +48,23 @@ impl Mode {
         self as u8
     }
 
+    /// Whether the hand goes where the operator's hand is.
+    #[must_use]
+    pub const fn follows(self) -> bool {
+        matches!(self, Self::Engaging | Self::Engaged)
+    }
+
     /// Lower-case English name, for people.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
-            Self::Idle => "idle",
+            Self::Disarmed => "disarmed",
+            Self::Armed => "armed",
+            Self::Engaging => "engaging",
             Self::Engaged => "engaged",
             Self::Holding => "holding",
+            Self::Relaxed => "relaxed",
+            Self::Stopped => "stopped",
             Self::Faulted => "faulted",
         }
     }

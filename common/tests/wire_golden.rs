@@ -7,7 +7,7 @@ mod samples;
 
 use std::fmt::Write as _;
 
-use samples::{health, joint_state, mapping, pose};
+use samples::{control, health, joint_state, mapping, pose};
 use teleop_common::wire::{MAX_MESSAGE, Message, decode, encode_into};
 
 #[track_caller]
@@ -39,6 +39,11 @@ fn mapping_bytes() {
 }
 
 #[test]
+fn control_bytes() {
+    golden(&control(), "control.hex", include_str!("golden/control.hex"));
+}
+
+#[test]
 fn health_bytes() {
     golden(&health(), "health.hex", include_str!("golden/health.hex"));
 }
@@ -52,7 +57,7 @@ fn offsets_of_the_document() {
 
     let message = pose();
     encode_into(&message, &mut bytes).unwrap();
-    assert_eq!(&bytes[..8], b"ALGT\x02\x00\x01\x00");
+    assert_eq!(&bytes[..8], b"ALGT\x03\x00\x01\x00");
     assert_eq!(u64_at(&bytes, 8), message.header.epoch);
     assert_eq!(u64_at(&bytes, 16), message.header.seq);
     assert_eq!(u64_at(&bytes, 24), message.header.sent.0);
@@ -69,6 +74,15 @@ fn offsets_of_the_document() {
     assert_eq!(f32_at(&bytes, 288), message.tuning.r2);
     assert_eq!(f32_at(&bytes, 292 + 4 * 4), message.tuning.contact[4]);
 
+    assert_eq!(bytes[312..317], [7, 0, 0, 0, 1]);
+    assert_eq!(&bytes[317..333], b"ada@lab\0\0\0\0\0\0\0\0\0");
+
+    let message = control();
+    encode_into(&message, &mut bytes).unwrap();
+    assert_eq!(bytes[32], 2);
+    assert_eq!(u64_at(&bytes, 33), message.robot);
+    assert_eq!(bytes[41..45], [5, 0, 0, 0]);
+
     let message = joint_state();
     encode_into(&message, &mut bytes).unwrap();
     assert_eq!(&bytes[56..58], &[1, 16]);
@@ -80,6 +94,9 @@ fn offsets_of_the_document() {
     for (at, values) in [(98, message.q), (198, message.dq), (298, message.tau), (398, message.q_command)] {
         assert_eq!(f32_at(&bytes, at + 4 * 15), values[15]);
     }
+
+    assert_eq!(bytes[498..502], [3, 0, 0, 0]);
+    assert_eq!(u64_at(&bytes, 502), message.holder);
 
     let message = mapping();
     encode_into(&message, &mut bytes).unwrap();
@@ -106,11 +123,14 @@ fn offsets_of_the_document() {
     assert_eq!(&bytes[32..34], &[2, 7]);
     assert_eq!(u64_at(&bytes, 34), message.ticks);
     assert_eq!(u64_at(&bytes, 42), message.overruns);
-    assert_eq!(f32_at(&bytes, 54), message.tick_us.p99);
-    assert_eq!(u64_at(&bytes, 62), message.poses_accepted);
-    assert_eq!(u64_at(&bytes, 70 + 8 * 7), message.rejected[7]);
-    assert_eq!(u64_at(&bytes, 134), message.holds);
-    assert_eq!(f32_at(&bytes, 142), message.age_ms.p50);
-    assert_eq!(u64_at(&bytes, 154), message.telemetry_dropped);
-    assert_eq!(f32_at(&bytes, 162), message.rate_hz);
+    assert_eq!(f32_at(&bytes, 58), message.tick_us.p99);
+    assert_eq!(u64_at(&bytes, 66), message.poses_accepted);
+    assert_eq!(u64_at(&bytes, 74 + 8 * 8), message.rejected[8]);
+    assert_eq!(u64_at(&bytes, 146), message.holds);
+    assert_eq!(f32_at(&bytes, 154), message.age_ms.p50);
+    assert_eq!(u64_at(&bytes, 170), message.telemetry_dropped);
+    assert_eq!(f32_at(&bytes, 178), message.rate_hz);
+    assert_eq!(&bytes[182..189], b"ada@lab");
+    assert_eq!(f32_at(&bytes, 198 + 3 * 16 + 4), message.stages[3].p95);
+    assert_eq!(f32_at(&bytes, 262 + 12), message.total_ms.max);
 }

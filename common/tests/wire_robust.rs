@@ -8,13 +8,13 @@ use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
 
 use proptest::prelude::*;
-use samples::{health, joint_state, mapping, master_pose, pose};
+use samples::{control, health, joint_state, mapping, master_pose, pose};
 use teleop_common::mapping::Tuning;
 use teleop_common::master::MasterPose;
 use teleop_common::time::MonoTime;
 use teleop_common::wire::{
-    Checked, Header, HealthMessage, JointStateMessage, MAX_MESSAGE, MappingMessage, Message, PoseMessage,
-    TuningMessage, WireError, decode, encode_into,
+    Checked, ControlMessage, Header, HealthMessage, JointStateMessage, MAX_MESSAGE, MappingMessage, Message,
+    PoseMessage, TuningMessage, WireError, decode, encode_into,
 };
 
 thread_local! {
@@ -72,6 +72,7 @@ fn decode_all(bytes: &[u8]) {
     one::<JointStateMessage>(bytes);
     one::<MappingMessage>(bytes);
     one::<HealthMessage>(bytes);
+    one::<ControlMessage>(bytes);
 }
 
 #[test]
@@ -109,11 +110,14 @@ fn truncation_and_trailing_bytes() {
     one(&joint_state());
     one(&mapping());
     one(&health());
+    one(&control());
 }
 
 #[test]
 fn every_bit_flip() {
-    for bytes in [encoded(&pose()), encoded(&joint_state()), encoded(&mapping()), encoded(&health())] {
+    for bytes in
+        [encoded(&pose()), encoded(&joint_state()), encoded(&mapping()), encoded(&health()), encoded(&control())]
+    {
         for bit in 0..8 * bytes.len() {
             let mut flipped = bytes.clone();
             flipped[bit / 8] ^= 1 << (bit % 8);
@@ -128,8 +132,8 @@ fn header_errors_say_what_is_wrong() {
     let mut bytes = encoded(&pose());
     bytes[4] = 9;
     let error = decode::<PoseMessage>(&bytes).unwrap_err();
-    assert_eq!(error, WireError::Protocol { ours: 2, theirs: 9 });
-    assert_eq!(error.to_string(), "peer speaks wire protocol 9, this side speaks 2: run the same release on both ends");
+    assert_eq!(error, WireError::Protocol { ours: 3, theirs: 9 });
+    assert_eq!(error.to_string(), "peer speaks wire protocol 9, this side speaks 3: run the same release on both ends");
     bytes[0] = b'X';
     assert_eq!(decode::<PoseMessage>(&bytes).unwrap_err(), WireError::Magic { found: *b"XLGT" });
 
@@ -181,7 +185,7 @@ fn every_float_must_be_finite() {
     one(&joint_state(), row(98, 100));
     let signals = (0..5).flat_map(|finger| row(150 + 70 * finger + 1, 16).chain([150 + 70 * finger + 66]));
     one(&mapping(), [40, 44].into_iter().chain(row(50, 25)).chain(signals));
-    one(&health(), row(50, 3).chain(row(142, 3)).chain([162]));
+    one(&health(), row(50, 4).chain(row(154, 4)).chain([178]).chain(row(198, 20)));
 }
 
 #[test]
@@ -201,7 +205,7 @@ fn values_out_of_range() {
     bad_pose(292 + 4 * 4, -0.001, "contact of the little");
     bad_pose(292 + 4, 0.021, "contact of the index"); // beyond r1
     let state = joint_state();
-    rejected(&state, 56, &[4], "mode");
+    rejected(&state, 56, &[8], "mode");
     rejected(&state, 57, &[0], "joints");
     rejected(&state, 57, &[26], "joints");
     rejected(&state, 57, &[15], "q"); // a value beyond the hand's joints
@@ -217,8 +221,15 @@ fn values_out_of_range() {
     rejected(&mapping, 150 + 5, &f(1.01), "k");
     rejected(&mapping, 150 + 1, &f(-0.01), "delta");
     rejected(&mapping, 150 + 65, &[4], "ik");
-    rejected(&health(), 32, &[4], "mode");
-    rejected(&health(), 162, &f(-1.0), "rate_hz");
+    rejected(&health(), 32, &[8], "mode");
+    rejected(&health(), 178, &f(-1.0), "rate_hz");
+    rejected(&pose(), 316, &[4], "request");
+    rejected(&control(), 32, &[0], "request");
+    rejected(&control(), 32, &[3], "request");
+    for name in [&b"a\x07"[..], b"\0a"] {
+        let errors = [poisoned(&pose(), 317, name).map(|_| ()), poisoned(&health(), 182, name).map(|_| ())];
+        assert_eq!(errors, [Err(WireError::Name { field: "operator" }); 2]);
+    }
 }
 
 #[test]
@@ -293,7 +304,7 @@ proptest! {
     fn joint_state_round_trip(
         joints in 1..=25_usize,
         values in prop::collection::vec(-99.0_f32..99.0, 25),
-        mode in 0..4_u8,
+        mode in 0..8_u8,
         counts in prop::array::uniform4(any::<u64>()),
         wall in any::<i64>(),
     ) {
@@ -309,7 +320,7 @@ proptest! {
     }
 
     #[test]
-    fn health_round_trip(counts in prop::array::uniform12(any::<u64>()), times in prop::array::uniform7(0.0_f32..1e6)) {
+    fn health_round_trip(counts in prop::collection::vec(any::<u64>(), 13), times in prop::array::uniform7(0.0_f32..1e6)) {
         let mut message = health();
         [message.ticks, message.overruns, message.poses_accepted, message.telemetry_dropped] =
             std::array::from_fn(|index| counts[index]);
@@ -326,10 +337,10 @@ proptest! {
 
     /// Garbage behind a right header and of the right length, which reaches the values.
     #[test]
-    fn garbage_values(kind in 1..=4_u8, bytes in prop::collection::vec(any::<u8>(), 500)) {
+    fn garbage_values(kind in 1..=5_u8, bytes in prop::collection::vec(any::<u8>(), 500)) {
         let mut bytes = bytes;
-        bytes.truncate([312, 498, 500, 166][usize::from(kind) - 1]);
-        bytes[..8].copy_from_slice(b"ALGT\x02\x00\x00\x00");
+        bytes.truncate([333, 510, 500, 278, 45][usize::from(kind) - 1]);
+        bytes[..8].copy_from_slice(b"ALGT\x03\x00\x00\x00");
         bytes[6] = kind;
         decode_all(&bytes);
     }

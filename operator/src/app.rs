@@ -1,18 +1,22 @@
 //! The program: logging, signals, exit codes, and which command runs.
 
 use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
 use std::time::Duration;
 
 use anyhow::{Context as _, anyhow};
 use teleop_common::key::Keys;
 use teleop_common::master::Gesture;
 use teleop_common::net::clock::random_epoch;
+use teleop_common::net::keyboard;
 
 use crate::calibrate;
-use crate::cli::{Cli, Command, LogArgs, WatchArgs};
+use crate::cli::{Cli, Command, ListArgs, LogArgs, StopArgs, WatchArgs};
 use crate::failure::{Failure, OrFail as _, open_session};
 use crate::feedback::Feedback;
+use crate::list::list;
 use crate::listen::Listener;
+use crate::request::{Requester, Wish};
 use crate::run::run;
 use crate::shutdown::Shutdown;
 use crate::terminal::{Terminal, say};
@@ -33,6 +37,8 @@ pub fn main(cli: Cli) -> Result<(), Failure> {
         Command::Run(args) => Some(&args.log),
         Command::Calibrate(args) => Some(&args.log),
         Command::Watch(args) => Some(&args.log),
+        Command::Stop(args) => Some(&args.log),
+        Command::List(args) => Some(&args.log),
         Command::Gestures => None,
     };
     if let Some(log) = log {
@@ -52,6 +58,8 @@ pub fn main(cli: Cli) -> Result<(), Failure> {
         }
         Command::Calibrate(args) => calibrate::calibrate(&args, &shutdown),
         Command::Watch(args) => watch_robot(&args, &shutdown),
+        Command::Stop(args) => stop_robot(&args),
+        Command::List(args) => list_robots(&args, &shutdown),
         Command::Gestures => {
             gestures();
             Ok(())
@@ -83,14 +91,20 @@ fn watch_signals(runtime: &tokio::runtime::Runtime, shutdown: &Shutdown) -> std:
     use tokio::signal::unix::{SignalKind, signal};
     let _context = runtime.enter();
     let (mut interrupt, mut terminate) = (signal(SignalKind::interrupt())?, signal(SignalKind::terminate())?);
+    let mut user = signal(SignalKind::user_defined1())?;
     let shutdown = shutdown.clone();
     runtime.spawn(async move {
         loop {
             tokio::select! {
                 _ = interrupt.recv() => {}
                 _ = terminate.recv() => {}
+                _ = user.recv() => {
+                    shutdown.nudge();
+                    continue;
+                }
             }
             if shutdown.requested() {
+                keyboard::restore();
                 std::process::exit(1);
             }
             shutdown.request();
@@ -103,6 +117,27 @@ fn gestures() {
     for gesture in Gesture::ALL {
         say(&format!("{gesture:<18} {:>6.1} s  {}", gesture.duration(), gesture.description())).ok();
     }
+}
+
+fn stop_robot(args: &StopArgs) -> Result<(), Failure> {
+    let keys = Keys::new(&args.robot.name).or_usage()?;
+    let session = open_session(&args.robot.connect, &[])?;
+    let epoch = random_epoch();
+    let feedback = Arc::new(Feedback::new(epoch));
+    let _listener = Listener::start(&session, &keys, &feedback).or_runtime()?;
+    let mut requester = Requester::new(&session, &keys, epoch, &feedback).or_runtime()?;
+    if requester.ask(Wish::Stop, &AtomicBool::new(false)).or_runtime()? {
+        say(&format!("robot {} is stopped, until the stop is reset", keys.name())).ok();
+        return Ok(());
+    }
+    let at = args.robot.connect.join(", ");
+    Err(Failure::Runtime(anyhow!("robot {} did not confirm the stop at {at}: use its own emergency stop", keys.name())))
+}
+
+fn list_robots(args: &ListArgs, shutdown: &Shutdown) -> Result<(), Failure> {
+    let session = open_session(&args.connect, &[])?;
+    list(&session, Duration::from_secs_f64(args.time), args.json, shutdown).or_runtime()?;
+    Ok(())
 }
 
 fn watch_robot(args: &WatchArgs, shutdown: &Shutdown) -> Result<(), Failure> {

@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use teleop_common::viz::Viewer;
 
+use crate::pilot::ClutchBy;
 use crate::robot_hand::RobotHand;
 
 /// Where the robot listens by default.
@@ -20,13 +21,21 @@ Examples:
   operator --source zenoh --calibration me.toml  hand data from any program, see below
   operator --connect tcp/192.168.0.7:7447        a robot on another machine
   operator calibrate --source hand.csv --output me.toml
+  operator --clutch auto                         a demonstration: follow whenever the robot is ready
   operator watch --json --duration 5             what the robot does, as JSON lines
+  operator stop                                  stop the hand, from any terminal; it stays stopped
+  operator list                                  robots, what they do and for whom
   operator gestures                              what --source knows
+
+The robot follows only while the clutch is closed. On a terminal: SPACE closes and opens the clutch, s stops the hand,
+r resets the stop, q quits. After a hold (a bad link) the clutch must be closed again.
 
 Any program can feed a hand with `--source zenoh`: connect it to tcp/127.0.0.1:7448 and put JSON on
 the Zenoh key allegro/v1/<name>/in/hand, one message per frame, either of
   {\"t\": 1.25, \"q\": [20 joint angles, rad: thumb, index, middle, ring, little, four each]}
   {\"t\": 1.25, \"keypoints\": [[x, y, z], ... 21 points, m, in the order of MediaPipe]}
+With --clutch input the clutch is moved on allegro/v1/<name>/in/clutch: {\"closed\": true} or {\"closed\": false}; a
+pedal says {\"closed\": true, \"for\": 0.3} again and again while it is pressed. SIGUSR1 does what SPACE does.
 
 Exit codes: 0 done (also after Ctrl-C), 1 failed while running, 2 wrong usage or configuration.";
 
@@ -52,6 +61,10 @@ pub enum Command {
     Calibrate(CalibrateArgs),
     /// Show what the robot does, without driving it
     Watch(WatchArgs),
+    /// Stop the robot's hand; the stop lasts until it is reset at the robot, or by the operator that drives it
+    Stop(StopArgs),
+    /// List the robots that can be reached, what they do, for whom, and how fast
+    List(ListArgs),
     /// List the scripted gestures
     Gestures,
 }
@@ -103,9 +116,18 @@ pub struct RunArgs {
     /// The robot hand that the mapping of keypoints is tuned for, unless the calibration file says how already
     #[arg(long, value_enum, default_value_t, value_name = "HAND")]
     pub robot_hand: RobotHand,
-    /// Where hand data of `--source zenoh` may arrive; repeatable
+    /// Where hand data of `--source zenoh`, and `--clutch input`, may arrive; repeatable
     #[arg(long, default_value = INPUT_ENDPOINT, value_name = "ENDPOINT")]
     pub listen: Vec<String>,
+    /// How the clutch is moved, which lets the robot follow [default: key on a terminal, start elsewhere]
+    #[arg(long, value_enum, value_name = "HOW", help_heading = "Authority")]
+    pub clutch: Option<ClutchBy>,
+    /// Take the robot from another operator, if the robot's configuration permits it
+    #[arg(long, help_heading = "Authority")]
+    pub takeover: bool,
+    /// Who drives, for people (16 characters) [default: user and host]
+    #[arg(long, value_name = "NAME", help_heading = "Authority")]
+    pub operator: Option<String>,
     /// Record what is streamed (joint angles, with the hand's sizes) into this new file, JSON lines
     #[arg(long, value_name = "FILE.jsonl")]
     pub record: Option<PathBuf>,
@@ -141,6 +163,34 @@ pub struct CalibrateArgs {
     /// Where live keypoints may arrive; repeatable
     #[arg(long, default_value = INPUT_ENDPOINT, value_name = "ENDPOINT")]
     pub listen: Vec<String>,
+    /// Logging.
+    #[command(flatten)]
+    pub log: LogArgs,
+}
+
+/// Options of `operator stop`.
+#[derive(Args, Clone, Debug)]
+pub struct StopArgs {
+    /// Which robot.
+    #[command(flatten)]
+    pub robot: RobotArgs,
+    /// Logging.
+    #[command(flatten)]
+    pub log: LogArgs,
+}
+
+/// Options of `operator list`.
+#[derive(Args, Clone, Debug)]
+pub struct ListArgs {
+    /// A robot or a router that robots are connected to; repeatable
+    #[arg(long, default_value = ROBOT_ENDPOINT, value_name = "ENDPOINT")]
+    pub connect: Vec<String>,
+    /// How long to listen to the robots found
+    #[arg(long, default_value_t = 1.0, value_name = "SECONDS", value_parser = seconds)]
+    pub time: f64,
+    /// One JSON object per robot
+    #[arg(long)]
+    pub json: bool,
     /// Logging.
     #[command(flatten)]
     pub log: LogArgs,

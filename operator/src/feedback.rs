@@ -80,6 +80,8 @@ pub struct Snapshot {
     pub first_bad: Option<WireError>,
     /// Two robots of the same name answer.
     pub rivals: bool,
+    /// What it does, and whether this operator has it; `None` if it is not connected.
+    pub authority: Option<(Mode, bool)>,
 }
 
 /// Why a robot does not follow.
@@ -91,15 +93,29 @@ pub enum Reason {
     Refused(Rejection),
     /// Its hand or process failed, with this code.
     Fault(u8),
-    /// It follows another operator.
+    /// Another operator has it.
     OtherOperator,
+    /// The clutch is open.
+    Clutch,
+    /// The clutch was just closed, and it is on its way.
+    OnItsWay,
+    /// It held, and the clutch has to be closed anew.
+    CloseAnew,
+    /// It was stopped.
+    Stopped,
 }
 
 impl std::fmt::Display for Reason {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         match self {
             Self::NoPoses => f.write_str("no poses arrive"),
-            Self::Refused(Rejection::Operator) | Self::OtherOperator => f.write_str("another operator drives it"),
+            Self::Refused(Rejection::Operator) | Self::OtherOperator => {
+                f.write_str("another operator has it (--takeover, if the robot permits it)")
+            }
+            Self::Clutch => f.write_str("close the clutch"),
+            Self::OnItsWay => f.write_str("on its way"),
+            Self::CloseAnew => f.write_str("close the clutch anew"),
+            Self::Stopped => f.write_str("reset the stop (here: r)"),
             Self::Refused(rejection) => write!(f, "poses refused: {}", rejection.name()),
             Self::Fault(code) => write!(f, "fault {code}, restart the robot"),
         }
@@ -246,6 +262,11 @@ impl Feedback {
             bad: state.bad,
             first_bad: state.first_bad,
             rivals: state.rivals.is_some_and(|at| now.since(at) < REASON_LASTS),
+            authority: state
+                .joints
+                .as_ref()
+                .filter(|_| connected)
+                .and_then(|joints| Some((joints.message.mode()?, joints.message.holder == self.epoch))),
         }
     }
 
@@ -276,9 +297,13 @@ impl State {
         let rejection = self.rejection.filter(|(_, at)| now.since(*at) < REASON_LASTS).map(|(why, _)| why);
         match joints.mode()? {
             Mode::Faulted => Some(Reason::Fault(self.health.as_ref().map_or(0, |heard| heard.message.fault))),
-            Mode::Engaged if joints.pose_epoch != epoch => Some(Reason::OtherOperator),
+            Mode::Stopped => Some(Reason::Stopped),
+            _ if joints.holder != 0 && joints.holder != epoch => Some(Reason::OtherOperator),
             Mode::Engaged => None,
-            Mode::Idle | Mode::Holding => Some(rejection.map_or(Reason::NoPoses, Reason::Refused)),
+            Mode::Engaging => Some(Reason::OnItsWay),
+            Mode::Armed => Some(Reason::Clutch),
+            Mode::Holding | Mode::Relaxed if joints.holder == epoch && rejection.is_none() => Some(Reason::CloseAnew),
+            Mode::Disarmed | Mode::Holding | Mode::Relaxed => Some(rejection.map_or(Reason::NoPoses, Reason::Refused)),
         }
     }
 }
@@ -286,7 +311,8 @@ impl State {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use teleop_common::wire::{Header, MAX_MESSAGE, Quantiles, Stamper, encode_into, pack_joints};
+    use teleop_common::authority::OperatorName;
+    use teleop_common::wire::{Header, MAX_MESSAGE, Quantiles, STAGES, Stamper, encode_into, pack_joints};
 
     const MS: u64 = 1_000_000;
     const OWN: u64 = 7;
@@ -316,6 +342,8 @@ mod tests {
             dq: pack_joints(&[0.0; 16]),
             tau: pack_joints(&[0.0; 16]),
             q_command: pack_joints(&[0.1; 16]),
+            stop: 0,
+            holder: pose_epoch,
         })
     }
 
@@ -333,6 +361,9 @@ mod tests {
             age_ms: Quantiles::default(),
             telemetry_dropped: 0,
             rate_hz: 333.0,
+            operator: OperatorName::default(),
+            stages: [Quantiles::default(); STAGES],
+            total_ms: Quantiles::default(),
         })
     }
 
@@ -363,7 +394,7 @@ mod tests {
         feedback.on_sent(MonoTime(100 * MS));
         let echo = Echo { epoch: OWN, sent: MonoTime(99 * MS), received: MonoTime(102 * MS) };
         let header = Stamper::new(9).header::<JointStateMessage>(MonoTime(103 * MS));
-        feedback.on_joints(arrival(&joints(header, echo, Mode::Idle, 0), MonoTime(104 * MS)));
+        feedback.on_joints(arrival(&joints(header, echo, Mode::Disarmed, 0), MonoTime(104 * MS)));
         assert_eq!(feedback.snapshot(MonoTime(104 * MS)).round_trip, None);
     }
 
@@ -376,20 +407,22 @@ mod tests {
             feedback.on_joints(arrival(&joints(header, Echo::NONE, mode, pose_epoch), MonoTime(at)));
             feedback.snapshot(MonoTime(at)).reason
         };
-        assert_eq!(tell(Mode::Idle, 0, MS), Some(Reason::NoPoses));
+        assert_eq!(tell(Mode::Disarmed, 0, MS), Some(Reason::NoPoses));
         assert_eq!(tell(Mode::Engaged, 8, 2 * MS), Some(Reason::OtherOperator));
         let mut stamps = Stamper::new(9);
         let mut rejected = [3; REJECTIONS];
         feedback
             .on_health(arrival(&health(stamps.header::<HealthMessage>(MonoTime(0)), 0, rejected), MonoTime(2 * MS)));
-        assert_eq!(tell(Mode::Holding, OWN, 3 * MS), Some(Reason::NoPoses), "old refusals explain nothing");
+        assert_eq!(tell(Mode::Holding, OWN, 3 * MS), Some(Reason::CloseAnew), "old refusals explain nothing");
+        assert_eq!(tell(Mode::Armed, OWN, 3 * MS + 1), Some(Reason::Clutch));
+        assert_eq!(tell(Mode::Stopped, 8, 3 * MS + 2), Some(Reason::Stopped));
         rejected[Rejection::Stale.index()] += 10;
         rejected[Rejection::Clock.index()] += 2;
         feedback
             .on_health(arrival(&health(stamps.header::<HealthMessage>(MonoTime(0)), 4, rejected), MonoTime(4 * MS)));
         assert_eq!(tell(Mode::Holding, OWN, 5 * MS), Some(Reason::Refused(Rejection::Stale)));
         assert_eq!(tell(Mode::Faulted, OWN, 6 * MS), Some(Reason::Fault(4)));
-        assert_eq!(tell(Mode::Holding, OWN, 3000 * MS), Some(Reason::NoPoses));
+        assert_eq!(tell(Mode::Holding, 0, 3000 * MS), Some(Reason::NoPoses));
     }
 
     #[test]
@@ -404,13 +437,13 @@ mod tests {
         let state =
             |epoch, seq, mode| joints(Header::new::<JointStateMessage>(epoch, seq, MonoTime(0)), Echo::NONE, mode, 0);
         let mode = || feedback.snapshot(MonoTime(0)).joints.unwrap().mode();
-        feedback.on_joints(arrival(&state(1, 5, Mode::Idle), MonoTime(0)));
+        feedback.on_joints(arrival(&state(1, 5, Mode::Disarmed), MonoTime(0)));
         feedback.on_joints(arrival(&state(1, 4, Mode::Holding), MonoTime(0)));
-        assert_eq!(mode(), Some(Mode::Idle));
+        assert_eq!(mode(), Some(Mode::Disarmed));
         feedback.on_joints(arrival(&state(2, 1, Mode::Holding), MonoTime(0)));
         assert_eq!(mode(), Some(Mode::Holding), "a robot that restarted");
         assert!(!feedback.snapshot(MonoTime(0)).rivals);
-        feedback.on_joints(arrival(&state(1, 6, Mode::Idle), MonoTime(0)));
+        feedback.on_joints(arrival(&state(1, 6, Mode::Disarmed), MonoTime(0)));
         assert!(feedback.snapshot(MonoTime(0)).rivals, "two robots");
     }
 }

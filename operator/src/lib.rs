@@ -9,11 +9,13 @@
 //! | [`stream`] | the publisher thread behind a latest-value slot |
 //! | [`feedback`] | the robot as last heard, round trip, clock offset |
 //! | [`listen`] | subscriptions to the robot, declared anew where nothing comes |
+//! | [`pilot`] | the clutch: when the robot may follow |
+//! | [`request`] | stops and resets |
 //! | [`terminal`] | the status line |
 //! | [`record`] | the recording of what is streamed |
 //! | [`run`] | `operator run`: the wiring of the above |
 //! | [`calibrate`] | `operator calibrate` |
-//! | [`watch`] | `operator watch` |
+//! | [`watch`], [`list`] | `operator watch`, `operator list` |
 //! | [`shutdown`], [`failure`] | ending in order; ending otherwise, with its exit code |
 //! | [`cli`], [`app`] | the command line; logging, signals |
 
@@ -23,9 +25,12 @@ pub mod cli;
 pub mod failure;
 pub mod feedback;
 pub mod hand;
+pub mod list;
 pub mod listen;
+pub mod pilot;
 pub mod pipeline;
 pub mod record;
+pub mod request;
 pub mod robot_hand;
 pub mod run;
 pub mod shutdown;

@@ -1,17 +1,21 @@
 //! `operator run`: streams a hand to the robot.
 
+use std::io::IsTerminal as _;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
 use anyhow::Context as _;
+use teleop_common::authority::OperatorName;
 use teleop_common::hand::HandSide;
 use teleop_common::key::Keys;
 use teleop_common::master::{Calibration, MasterGeometry};
 use teleop_common::net::clock::{now, random_epoch};
-use teleop_common::net::{Session, Stream};
+use teleop_common::net::keyboard::Keyboard;
+use teleop_common::net::{NetError, Session, Stream, Subscriber};
 use teleop_common::recording::RecordingHeader;
 use teleop_common::viz::{Level, Scene, Viz};
+use teleop_common::wire::latency_report;
 
 use crate::calibrate;
 use crate::cli::{RunArgs, Switch};
@@ -19,8 +23,10 @@ use crate::failure::{Failure, OrFail as _, open_session};
 use crate::feedback::Feedback;
 use crate::hand::PoseFinder;
 use crate::listen::Listener;
+use crate::pilot::{ClutchBy, Pilot};
 use crate::pipeline::{Parts, Pipeline, Progress, picture_time};
 use crate::record::Recorder;
+use crate::request::{Requester, Requests, Wish};
 use crate::robot_hand::RobotHand;
 use crate::shutdown::Shutdown;
 use crate::source::{GestureSource, RecordingFile, Source, SourceSpec, ZenohSource};
@@ -46,11 +52,13 @@ pub struct Summary {
     pub round_trip: Option<(Duration, Duration)>,
     /// Frames written to the recording and frames lost, if there is a recording.
     pub recorded: Option<(u64, u64)>,
+    /// Where the time went from the human hand to the robot hand, as the robot tells it.
+    pub latency: Option<String>,
 }
 
 impl std::fmt::Display for Summary {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let Self { sent, progress, round_trip, recorded } = self;
+        let Self { sent, progress, round_trip, recorded, latency } = self;
         let seconds = progress.span.map_or(0.0, |(first, last)| last.since(first).as_secs_f64());
         write!(f, "streamed {sent} poses in {seconds:.1} s")?;
         if progress.poses > 1 && seconds > 0.0 {
@@ -71,6 +79,9 @@ impl std::fmt::Display for Summary {
             if *lost > 0 {
                 write!(f, " ({lost} LOST)")?;
             }
+        }
+        if let Some(latency) = latency {
+            write!(f, "\n{latency}")?;
         }
         Ok(())
     }
@@ -174,7 +185,9 @@ pub fn run(args: &RunArgs, shutdown: &Shutdown, terminal: &Terminal) -> Result<S
     let keys = Keys::new(&args.robot.name).or_usage()?;
     let plan = Plan::new(args)?;
     let (is_recording, side) = (plan.is_recording(), plan.side);
-    let session = open_session(&args.robot.connect, if plan.is_live() { &args.listen } else { &[] })?;
+    let pilot = Pilot::new(args.clutch.unwrap_or_else(default_clutch), operator_name(args)?, args.takeover);
+    let inputs = plan.is_live() || args.clutch == Some(ClutchBy::Input);
+    let session = open_session(&args.robot.connect, if inputs { &args.listen } else { &[] })?;
     let (recorder, record) = match &args.record {
         Some(path) => Recorder::create(path, &args.source, side).map(|(a, b)| (Some(a), Some(b))).or_usage()?,
         None => (None, None),
@@ -189,7 +202,10 @@ pub fn run(args: &RunArgs, shutdown: &Shutdown, terminal: &Terminal) -> Result<S
     let scene = Scene::operator(keys.name(), side);
     let viz = Viz::start(args.viewer.clone(), scene).or_runtime()?;
     let logger = viz.logger();
-    let (stream, sender) = PoseStream::start(publisher, epoch, Arc::clone(&feedback)).or_runtime()?;
+    let requests = Requests::start(Requester::new(&session, &keys, epoch, &feedback).or_runtime()?).or_runtime()?;
+    let keyboard = listen_to_keys(&pilot, &requests, shutdown);
+    let clutch_input = if inputs { Some(listen_to_clutch(&session, &keys, &pilot).or_runtime()?) } else { None };
+    let (stream, sender) = PoseStream::start(publisher, epoch, Arc::clone(&feedback), pilot.clone()).or_runtime()?;
     let pipeline = Pipeline::start(Parts {
         source: open(plan.input, &session, &keys)?,
         finder: plan.finder.filtered(args.filter == Switch::On),
@@ -225,7 +241,7 @@ pub fn run(args: &RunArgs, shutdown: &Shutdown, terminal: &Terminal) -> Result<S
         }
     }
     shutdown.request();
-    drop(display);
+    drop((display, keyboard, clutch_input, requests));
 
     // In the order of the data: source, network and recording, picture.
     let (progress, result) = pipeline.join();
@@ -242,7 +258,49 @@ pub fn run(args: &RunArgs, shutdown: &Shutdown, terminal: &Terminal) -> Result<S
     }
     let trips = feedback.round_trips();
     let round_trip = (trips.count() > 0).then(|| (trips.p50(), trips.p99()));
-    Ok(Summary { sent, progress, round_trip, recorded })
+    let health = feedback.snapshot(now()).health.filter(|health| health.total_ms.max > 0.0);
+    let latency = health.map(|health| latency_report(&health.stages, &health.total_ms));
+    Ok(Summary { sent, progress, round_trip, recorded, latency })
+}
+
+/// Somebody at a terminal moves the clutch; where nobody is, starting the program is the deliberate act.
+fn default_clutch() -> ClutchBy {
+    if std::io::stdin().is_terminal() { ClutchBy::Key } else { ClutchBy::Start }
+}
+
+fn operator_name(args: &RunArgs) -> Result<OperatorName, Failure> {
+    if let Some(name) = &args.operator {
+        return OperatorName::new(name).or_usage();
+    }
+    let user = std::env::var("USER").unwrap_or_else(|_| "operator".to_owned());
+    let host = std::fs::read_to_string("/proc/sys/kernel/hostname").unwrap_or_default();
+    Ok(OperatorName::lossy(&format!("{user}@{}", host.trim())))
+}
+
+/// SPACE moves the clutch, s stops, r resets, q quits; without a terminal SIGUSR1 does what SPACE does.
+fn listen_to_keys(pilot: &Pilot, requests: &Requests, shutdown: &Shutdown) -> Option<Keyboard> {
+    let nudged = pilot.clone();
+    shutdown.on_nudge(move || nudged.on_space(now()));
+    let (pilot, wish, shutdown) = (pilot.clone(), requests.wisher(), shutdown.clone());
+    Keyboard::listen(move |key| match key {
+        b' ' => pilot.on_space(now()),
+        b's' => wish(Wish::Stop),
+        b'r' => wish(Wish::Reset),
+        b'q' => shutdown.request(),
+        _ => {}
+    })
+}
+
+fn listen_to_clutch(session: &Session, keys: &Keys, pilot: &Pilot) -> Result<Subscriber, NetError> {
+    let (pilot, mut told) = (pilot.clone(), false);
+    session.subscribe(&keys.clutch_input(), move |arrival| {
+        let bytes = arrival.payload.unwrap_or(b"");
+        if let Err(error) = pilot.on_input(bytes, arrival.at)
+            && !std::mem::replace(&mut told, true)
+        {
+            tracing::error!("clutch input refused: {error}; it is {{\"closed\": true}} (more of them are not told)");
+        }
+    })
 }
 
 /// The side of the robot's hand, if it is there to say: a hand that belongs to neither side is drawn as that one.

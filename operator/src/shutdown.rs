@@ -3,9 +3,11 @@
 use std::sync::{Arc, Condvar, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
-/// Tells all threads that the end has come. Cheap to clone.
-#[derive(Clone, Debug, Default)]
-pub struct Shutdown(Arc<(Mutex<bool>, Condvar)>);
+/// Tells all threads that the end has come, and passes SIGUSR1 on. Cheap to clone.
+#[derive(Clone, Default)]
+pub struct Shutdown(Arc<(Mutex<bool>, Condvar)>, Arc<Mutex<Option<Nudged>>>);
+
+type Nudged = Box<dyn Fn() + Send>;
 
 impl Shutdown {
     /// Asks everybody to end.
@@ -19,6 +21,18 @@ impl Shutdown {
     #[must_use]
     pub fn requested(&self) -> bool {
         *self.0.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Calls `nudged` at every [`Shutdown::nudge`] from now on, in place of whatever was called before.
+    pub fn on_nudge(&self, nudged: impl Fn() + Send + 'static) {
+        *self.1.lock().unwrap_or_else(PoisonError::into_inner) = Some(Box::new(nudged));
+    }
+
+    /// The process got SIGUSR1.
+    pub fn nudge(&self) {
+        if let Some(nudged) = self.1.lock().unwrap_or_else(PoisonError::into_inner).as_ref() {
+            nudged();
+        }
     }
 
     /// Waits for the end, at most for `timeout`; true if it has come.

@@ -5,6 +5,7 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
+use teleop_common::authority::Intent;
 use teleop_common::master::MasterPose;
 use teleop_common::net::clock::now;
 use teleop_common::net::{NetError, Publisher};
@@ -12,9 +13,13 @@ use teleop_common::time::MonoTime;
 use teleop_common::wire::{PoseMessage, Stamper};
 
 use crate::feedback::Feedback;
+use crate::pilot::Pilot;
 
 /// How often the publisher looks whether it should end.
 const LOOK: Duration = Duration::from_millis(100);
+/// How often it says that it leaves.
+const FAREWELLS: u32 = 3;
+const FAREWELL_EVERY: Duration = Duration::from_millis(5);
 
 /// A pose on its way to the network.
 #[derive(Clone, Copy, Debug)]
@@ -50,23 +55,32 @@ pub struct PoseStream {
 }
 
 impl PoseStream {
-    /// Starts publishing on `publisher` as the process `epoch`, with echoes from `feedback`.
+    /// Starts publishing on `publisher` as the process `epoch`, with echoes from `feedback` and what `pilot` wants. When
+    /// it ends it gives the robot back.
     ///
     /// # Errors
     /// The system refuses a thread.
-    pub fn start(publisher: Publisher, epoch: u64, feedback: Arc<Feedback>) -> std::io::Result<(Self, PoseSender)> {
+    pub fn start(
+        publisher: Publisher,
+        epoch: u64,
+        feedback: Arc<Feedback>,
+        pilot: Pilot,
+    ) -> std::io::Result<(Self, PoseSender)> {
         let (slot, mut poses) = triple_buffer::triple_buffer(&None);
         let (counters, stop) = (Arc::new(StreamCounters::default()), Arc::new(AtomicBool::new(false)));
         let (count, stopped) = (Arc::clone(&counters), Arc::clone(&stop));
         let thread = std::thread::Builder::new().name("publisher".to_owned()).spawn(move || {
             let mut stamper = Stamper::new(epoch);
+            let mut last = None;
             while !stopped.load(Ordering::Acquire) {
                 let news = if poses.update() { *poses.output_buffer() } else { None };
                 let Some(outgoing) = news else {
                     std::thread::park_timeout(LOOK);
                     continue;
                 };
-                match send(&publisher, &mut stamper, &feedback, &outgoing) {
+                last = Some(outgoing);
+                pilot.step(now(), feedback.snapshot(now()).authority);
+                match send(&publisher, &mut stamper, &feedback, &outgoing, pilot.intent()) {
                     Ok(sent) => {
                         count.sent.fetch_add(1, Ordering::Relaxed);
                         count.last_sent.store(sent.0, Ordering::Release);
@@ -78,6 +92,13 @@ impl PoseStream {
                         }
                     }
                 }
+            }
+            // Any one of them suffices.
+            for _ in 0..FAREWELLS {
+                let Some(last) = last else { break };
+                let outgoing = Outgoing { captured: now(), ..last };
+                send(&publisher, &mut stamper, &feedback, &outgoing, pilot.farewell(now())).ok();
+                std::thread::sleep(FAREWELL_EVERY);
             }
         })?;
         let sender = PoseSender { slot, publisher: thread.thread().clone() };
@@ -116,11 +137,12 @@ fn send(
     stamper: &mut Stamper,
     feedback: &Feedback,
     outgoing: &Outgoing,
+    intent: Intent,
 ) -> Result<MonoTime, NetError> {
     let sent = now();
     // Before the pose is on its way, or its echo could come back first.
     feedback.on_sent(sent);
     let header = stamper.header::<PoseMessage>(sent);
-    publisher.send(&PoseMessage::new(header, feedback.echo(sent), outgoing.captured, &outgoing.pose))?;
+    publisher.send(&PoseMessage::new(header, feedback.echo(sent), outgoing.captured, &outgoing.pose, intent))?;
     Ok(sent)
 }

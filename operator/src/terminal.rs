@@ -285,10 +285,12 @@ impl std::io::Write for LogWriter {
 mod tests {
     use super::*;
     use crate::feedback::Feedback;
+    use teleop_common::authority::OperatorName;
     use teleop_common::net::Arrival;
     use teleop_common::time::MonoTime;
     use teleop_common::wire::{
-        Echo, Header, HealthMessage, JointStateMessage, MAX_MESSAGE, Message, Quantiles, encode_into, pack_joints,
+        Echo, Header, HealthMessage, JointStateMessage, MAX_MESSAGE, Message, Quantiles, REJECTIONS, STAGES,
+        encode_into, pack_joints,
     };
 
     fn bytes<M: Message>(message: &M) -> Vec<u8> {
@@ -316,6 +318,8 @@ mod tests {
                 dq: pack_joints(&[]),
                 tau: pack_joints(&[]),
                 q_command: pack_joints(&[]),
+                stop: 0,
+                holder: 7,
             };
             feedback.on_joints(Arrival { payload: Ok(&bytes(&joints)), at: MonoTime(3_200_000) });
             let health = HealthMessage {
@@ -326,11 +330,14 @@ mod tests {
                 overruns: 0,
                 tick_us: Quantiles::default(),
                 poses_accepted: 5,
-                rejected: [0; 8],
+                rejected: [0; REJECTIONS],
                 holds: 0,
-                age_ms: Quantiles { p50: 1.0, p99: 3.12, max: 4.0 },
+                age_ms: Quantiles { p50: 1.0, p95: 2.0, p99: 3.12, max: 4.0 },
                 telemetry_dropped: 0,
                 rate_hz: 333.0,
+                operator: OperatorName::default(),
+                stages: [Quantiles::default(); STAGES],
+                total_ms: Quantiles::default(),
             };
             feedback.on_health(Arrival { payload: Ok(&bytes(&health)), at: now });
         }

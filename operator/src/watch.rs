@@ -7,7 +7,7 @@ use serde::{Serialize, Serializer};
 use teleop_common::hand::Finger;
 use teleop_common::mode::Mode;
 use teleop_common::net::clock::now;
-use teleop_common::wire::{FingerMessage, HealthMessage, JointStateMessage, MappingMessage, Rejection};
+use teleop_common::wire::{FingerMessage, HealthMessage, JointStateMessage, MappingMessage, Rejection, Stage};
 
 use crate::feedback::Feedback;
 use crate::shutdown::Shutdown;
@@ -107,6 +107,8 @@ struct Line<'a> {
     t: f64,
     mode: Option<&'static str>,
     tick: u64,
+    stop: u32,
+    holder: String,
     q: &'a [f32],
     q_command: &'a [f32],
     dq: &'a [f32],
@@ -137,6 +139,9 @@ struct HealthPart {
     age_ms_p99: f32,
     rejected: BTreeMap<String, u64>,
     telemetry_dropped: u64,
+    operator: String,
+    /// p50, p95, p99 and maximum of every stage and of the whole way, ms.
+    latency_ms: BTreeMap<&'static str, [f32; 4]>,
 }
 
 /// Values of fingers, an object keyed by their names.
@@ -176,6 +181,13 @@ impl HealthPart {
             age_ms_p99: health.age_ms.p99,
             rejected: rejected.into_iter().collect(),
             telemetry_dropped: health.telemetry_dropped,
+            operator: health.operator.to_string(),
+            latency_ms: Stage::ALL
+                .iter()
+                .map(|stage| (stage.name(), &health.stages[*stage as usize]))
+                .chain([("total", &health.total_ms)])
+                .map(|(name, of)| (name, [of.p50, of.p95, of.p99, of.max]))
+                .collect(),
         }
     }
 }
@@ -192,6 +204,8 @@ fn json_line(
         t: (elapsed.as_secs_f64() * 1e6).round() / 1e6,
         mode: joints.mode().map(Mode::name),
         tick: joints.tick,
+        stop: joints.stop,
+        holder: format!("{:016x}", joints.holder),
         q: &joints.q[..count],
         q_command: &joints.q_command[..count],
         dq: &joints.dq[..count],
@@ -219,7 +233,10 @@ fn text_line(
         let rejected: u64 = health.rejected.iter().fold(0, |sum, count| sum.saturating_add(*count));
         parts.push(format!("control {:.1} Hz", health.rate_hz));
         parts.push(format!("poses {} obeyed, {rejected} refused", health.poses_accepted));
-        parts.push(format!("age {:.1} ms (p99)", health.age_ms.p99));
+        parts.push(format!("latency {:.1} ms p50, {:.1} ms p99", health.total_ms.p50, health.total_ms.p99));
+        if !health.operator.as_str().is_empty() {
+            parts.push(format!("operator {}", health.operator));
+        }
         parts.push(format!("holds {}", health.holds));
     }
     if let Some(mapping) = mapping {
@@ -239,7 +256,7 @@ mod tests {
     use teleop_common::mapping::{MappingParams, Retargeter};
     use teleop_common::master::{Gesture, MasterGeometry, MasterPose};
     use teleop_common::time::MonoTime;
-    use teleop_common::wire::{Echo, Header, Quantiles, REJECTIONS, pack_joints};
+    use teleop_common::wire::{Echo, Header, Quantiles, REJECTIONS, STAGES, pack_joints};
 
     fn joints() -> JointStateMessage {
         JointStateMessage {
@@ -256,13 +273,20 @@ mod tests {
             dq: pack_joints(&[0.0; 16]),
             tau: pack_joints(&[0.0; 16]),
             q_command: pack_joints(&[0.2; 16]),
+            stop: 0,
+            holder: 7,
         }
     }
 
     #[test]
     fn a_robot_that_was_only_just_heard_has_joints_alone() {
         let line = json_line(&joints(), None, None, Duration::from_micros(100_000));
-        assert!(line.starts_with("{\"t\":0.1,\"mode\":\"engaged\",\"tick\":77,\"q\":[0.1,"), "{line}");
+        assert!(
+            line.starts_with(
+                "{\"t\":0.1,\"mode\":\"engaged\",\"tick\":77,\"stop\":0,\"holder\":\"0000000000000007\",\"q\":[0.1,"
+            ),
+            "{line}"
+        );
         let value: Value = serde_json::from_str(&line).unwrap();
         assert_eq!(value["q_command"].as_array().unwrap().len(), 16);
         assert!(value.get("k").is_none() && value.get("rate_hz").is_none());
@@ -287,9 +311,12 @@ mod tests {
             poses_accepted: 50,
             rejected,
             holds: 2,
-            age_ms: Quantiles { p50: 1.0, p99: 3.5, max: 4.0 },
+            age_ms: Quantiles { p50: 1.0, p95: 2.0, p99: 3.5, max: 4.0 },
             telemetry_dropped: 0,
             rate_hz: 333.3,
+            operator: OperatorName::default(),
+            stages: [Quantiles::default(); STAGES],
+            total_ms: Quantiles::default(),
         };
         let line = json_line(&joints(), Some(&mapping), Some(&health), Duration::ZERO);
         let value: Value = serde_json::from_str(&line).unwrap();

@@ -68,7 +68,7 @@ impl Peer {
                 let newest = heard.lock().unwrap().last().copied();
                 let joints = JointStateMessage {
                     echo: newest.map_or(Echo::NONE, |(pose, at)| Echo::of(&pose.header, at)),
-                    mode: if newest.is_some() { Mode::Engaged } else { Mode::Idle }.to_wire(),
+                    mode: if newest.is_some() { Mode::Engaged } else { Mode::Disarmed }.to_wire(),
                     joints: 16,
                     tick,
                     wall_offset_ns: wall_offset_ns(),
@@ -79,6 +79,8 @@ impl Peer {
                     dq: pack_joints(&[0.0; 16]),
                     tau: pack_joints(&[0.0; 16]),
                     q_command: pack_joints(&[0.1; 16]),
+                    stop: 0,
+                    holder: newest.map_or(0, |(pose, _)| pose.header.epoch),
                     header: stamper.header::<JointStateMessage>(now()),
                 };
                 publisher.send(&joints).unwrap();

@@ -10,6 +10,7 @@ use std::time::Duration;
 use anyhow::Context as _;
 use teleop_common::hand::{FingerChain, HandModel, Joint};
 use teleop_common::key::Keys;
+use teleop_common::net::keyboard::Keyboard;
 use teleop_common::net::{Session, SessionConfig, clock};
 use teleop_common::viz::{Hub, HubOptions, Scene, Viz};
 use teleop_common::wire;
@@ -19,7 +20,7 @@ use crate::config::{Config, ConfigError};
 use crate::control::Controller;
 use crate::driver::SimHand;
 use crate::receive::{PoseSubscription, Receiver};
-use crate::runtime::{ControlThread, LoopRecord};
+use crate::runtime::{ControlThread, LoopRecord, Shared};
 use crate::telemetry::Telemetry;
 use crate::usage::{UsageError, is_usage};
 
@@ -85,7 +86,8 @@ fn run(args: &RunArgs) -> anyhow::Result<()> {
 
     let driver = Box::new(SimHand::new(&hand, 1.0 / config.control.rate));
     let (control, link) = ControlThread::start(controller, driver, config.control.rate, args.realtime)?;
-    let receiver = Arc::new(Mutex::new(Receiver::new(epoch, config.gate, link.poses)));
+    let shared = link.shared;
+    let receiver = Arc::new(Mutex::new(Receiver::new(epoch, config.lease, link.poses, Arc::clone(&shared))));
     let telemetry =
         Telemetry::new(&session, &keys, epoch, Arc::clone(&receiver), viz.logger(), &hand, config.mapping.clone())?;
     let control = Arc::new(control);
@@ -103,27 +105,57 @@ fn run(args: &RunArgs) -> anyhow::Result<()> {
         if control.is_realtime() { " with real-time priority" } else { "" },
         session.locators().join(", ")
     );
-    let end = wait_for_the_end(args.duration, || control.is_running());
-    drop((server, token));
+    let keyboard = listen_to_keys(&shared);
+    if keyboard.is_some() {
+        tracing::info!("SPACE or s stops the hand, r resets the stop");
+    }
+    let end = wait_for_the_end(args.duration, || control.is_running(), Some(&shared));
+    drop((keyboard, server, token));
     let stopped_early = !control.is_running();
-    drop(telemetry);
+    let latency = telemetry.finish();
     drop(control);
     viz.shutdown(Duration::from_secs(1));
     session.close().ok();
     end?;
     anyhow::ensure!(!stopped_early, "the control loop ended by itself, see the log");
+    if let Some(latency) = latency {
+        tracing::info!("{latency}");
+    }
     tracing::info!("robot {:?} stopped", args.name);
     Ok(())
+}
+
+/// Stop and reset at the robot itself.
+fn listen_to_keys(shared: &Arc<Shared>) -> Option<Keyboard> {
+    let shared = Arc::clone(shared);
+    Keyboard::listen(move |key| match key {
+        b' ' | b's' => stop(&shared),
+        b'r' => reset(&shared),
+        _ => {}
+    })
+}
+
+fn stop(shared: &Shared) {
+    if shared.latch.stop() {
+        tracing::warn!("stop: asked for at the robot");
+    }
+}
+
+fn reset(shared: &Shared) {
+    if shared.latch.reset_any() {
+        tracing::warn!("stop reset at the robot");
+    }
 }
 
 fn view(args: &ViewerArgs) -> anyhow::Result<()> {
     let hub = Hub::open(&HubOptions { bind: args.bind, ..HubOptions::default() })?;
     tracing::info!("viewer: open {} in a browser; processes connect with --viewer connect=HOST", hub.page());
-    wait_for_the_end(None, || true)
+    wait_for_the_end(None, || true, None)
 }
 
-/// Blocks until Ctrl-C, SIGTERM, the end of `duration` seconds, or `alive` turning false.
-fn wait_for_the_end(duration: Option<f64>, alive: impl Fn() -> bool) -> anyhow::Result<()> {
+/// Blocks until Ctrl-C, SIGTERM, the end of `duration` seconds, or `alive` turning false. Meanwhile SIGUSR1 stops the
+/// hand of `shared` and SIGUSR2 resets the stop.
+fn wait_for_the_end(duration: Option<f64>, alive: impl Fn() -> bool, shared: Option<&Shared>) -> anyhow::Result<()> {
     let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build()?;
     runtime.block_on(async {
         use tokio::signal::unix::{SignalKind, signal};
@@ -140,7 +172,19 @@ fn wait_for_the_end(duration: Option<f64>, alive: impl Fn() -> bool) -> anyhow::
                 tokio::time::sleep(Duration::from_millis(100)).await;
             }
         };
+        let buttons = async {
+            let Some(shared) = shared else { return std::future::pending().await };
+            let both = signal(SignalKind::user_defined1()).and_then(|a| Ok((a, signal(SignalKind::user_defined2())?)));
+            let Ok((mut press, mut release)) = both else { return std::future::pending().await };
+            loop {
+                tokio::select! {
+                    _ = press.recv() => stop(shared),
+                    _ = release.recv() => reset(shared),
+                }
+            }
+        };
         tokio::select! {
+            () = buttons => {}
             _ = interrupt.recv() => {}
             _ = terminate.recv() => {}
             () = deadline => {}
@@ -174,12 +218,19 @@ fn describe(name: &str, hand: &HandModel, config: &Config) -> String {
         "mapping": config.mapping,
         "control": {
             "rate_hz": config.control.rate,
-            "hold_after_s": config.control.hold_after.as_secs_f64(),
-            "max_age_s": config.gate.max_age.as_secs_f64(),
             "smoothing_s": config.control.smoothing,
             "engage_speed_rad_s": config.control.engage_speed,
             "engage_ramp_s": config.control.engage_ramp,
             "tip_overlap_m": config.control.tip_overlap,
+        },
+        "authority": {
+            "hold_after_s": config.control.hold_after.as_secs_f64(),
+            "max_age_s": config.lease.max_age.as_secs_f64(),
+            "release_after_s": config.lease.release_after.as_secs_f64(),
+            "takeover": config.lease.takeover,
+            "relax": config.control.relax,
+            "relax_after_s": config.control.relax_after.as_secs_f64(),
+            "stop": config.control.stop,
         },
     })
     .to_string()
@@ -188,7 +239,7 @@ fn describe(name: &str, hand: &HandModel, config: &Config) -> String {
 /// Reads the control loop's records, and keeps the subscription to poses alive, until dropped.
 struct TelemetryThread {
     stop: Arc<AtomicBool>,
-    thread: Option<JoinHandle<()>>,
+    thread: Option<JoinHandle<Option<String>>>,
 }
 
 impl TelemetryThread {
@@ -210,8 +261,15 @@ impl TelemetryThread {
                 }
                 std::thread::sleep(TELEMETRY_PERIOD);
             }
+            telemetry.latency_report()
         })?;
         Ok(Self { stop, thread: Some(thread) })
+    }
+
+    /// Ends it, and says where the time went on the way from the human hand to the robot hand.
+    fn finish(mut self) -> Option<String> {
+        self.stop.store(true, Ordering::Relaxed);
+        self.thread.take()?.join().ok()?
     }
 }
 

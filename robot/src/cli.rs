@@ -27,8 +27,17 @@ Configuration file (--config FILE), every value optional:
   r2 = 0.06                   # thumb_map (auto, angles, directions), tuning (operator, fixed): an r1, r2 or scale
                               # given here holds whatever the operator's tuning says;
                               # baseline = { scale, low_pass } of the modes vector and dexpilot
-  [control]                   # rate_hz, hold_after_s, max_age_s, smoothing_s, engage_speed_rad_s, engage_ramp_s,
-  hold_after_s = 0.2          # tip_overlap_m, velocity_scale, acceleration_scale
+  [control]                   # rate_hz, smoothing_s, engage_speed_rad_s, engage_ramp_s, tip_overlap_m,
+  smoothing_s = 0.008         # velocity_scale, acceleration_scale
+  [authority]                 # max_age_s, release_after_s (a silent operator loses the robot), relax_after_s,
+  hold_after_s = 0.1          # holds still so long after a pose was due
+  takeover = \"never\"          # or idle, always: when another operator may take the robot
+  relax = \"hold\"              # or yield (less torque), open, off: after holding for relax_after_s
+  stop = \"hold\"               # or off: what a stop does once the hand has braked
+  [playout]                   # mode (auto, direct, fixed), max_delay_s, tolerance_s, predict_s: poses that arrive
+  mode = \"auto\"               # unevenly are played evenly, with as much delay as the link needs and none on a good one
+
+On a terminal SPACE or s stops the hand and r resets the stop; elsewhere the signals SIGUSR1 and SIGUSR2 do.
 
 Exit codes: 0 done (also after Ctrl-C), 1 failed while running, 2 wrong usage or configuration.";
 

@@ -4,10 +4,12 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
+use teleop_common::authority::{LeaseParams, Takeover};
 use teleop_common::hand::{HandError, HandModel, HandSide, allegro_v4_texts};
 use teleop_common::mapping::{MappingMode, MappingParams, ParamError, Pinned};
+use teleop_common::playout::{PlayoutMode, PlayoutParams};
 
-use crate::control::{ControlParams, GateParams};
+use crate::control::{ControlParams, Relax, StopAction};
 
 /// Everything that can be set in a configuration file, with its defaults.
 ///
@@ -17,6 +19,8 @@ use crate::control::{ControlParams, GateParams};
 /// r2 = 0.06
 /// [control]
 /// rate_hz = 333.0
+/// [authority]
+/// takeover = "idle"
 /// ```
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -24,11 +28,67 @@ struct File {
     preset: String,
     mapping: toml::Table,
     control: ControlFile,
+    authority: AuthorityFile,
+    playout: PlayoutFile,
 }
 
 impl Default for File {
     fn default() -> Self {
-        Self { preset: "default".to_owned(), mapping: toml::Table::new(), control: ControlFile::default() }
+        Self {
+            preset: "default".to_owned(),
+            mapping: toml::Table::new(),
+            control: ControlFile::default(),
+            authority: AuthorityFile::default(),
+            playout: PlayoutFile::default(),
+        }
+    }
+}
+
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+struct AuthorityFile {
+    hold_after_s: f64,
+    max_age_s: f64,
+    release_after_s: f64,
+    takeover: Takeover,
+    relax: Relax,
+    relax_after_s: f64,
+    stop: StopAction,
+}
+
+impl Default for AuthorityFile {
+    fn default() -> Self {
+        let params = ControlParams::default();
+        Self {
+            hold_after_s: params.hold_after.as_secs_f64(),
+            max_age_s: 0.25,
+            release_after_s: 2.0,
+            takeover: Takeover::Never,
+            relax: params.relax,
+            relax_after_s: params.relax_after.as_secs_f64(),
+            stop: params.stop,
+        }
+    }
+}
+
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+struct PlayoutFile {
+    mode: PlayoutMode,
+    max_delay_s: f64,
+    tolerance_s: f64,
+    predict_s: f64,
+}
+
+impl Default for PlayoutFile {
+    fn default() -> Self {
+        let params = PlayoutParams::default();
+        Self {
+            mode: params.mode,
+            max_delay_s: params.max_delay.as_secs_f64(),
+            tolerance_s: params.tolerance.as_secs_f64(),
+            predict_s: params.predict.as_secs_f64(),
+        }
     }
 }
 
@@ -36,8 +96,6 @@ impl Default for File {
 #[serde(deny_unknown_fields, default)]
 struct ControlFile {
     rate_hz: f64,
-    hold_after_s: f64,
-    max_age_s: f64,
     smoothing_s: f64,
     engage_speed_rad_s: f64,
     engage_ramp_s: f64,
@@ -51,8 +109,6 @@ impl Default for ControlFile {
         let params = ControlParams::default();
         Self {
             rate_hz: params.rate,
-            hold_after_s: params.hold_after.as_secs_f64(),
-            max_age_s: 0.25,
             smoothing_s: params.smoothing,
             engage_speed_rad_s: params.engage_speed,
             engage_ramp_s: params.engage_ramp,
@@ -82,7 +138,7 @@ pub struct Config {
     /// The loop.
     pub control: ControlParams,
     /// Whose poses are obeyed.
-    pub gate: GateParams,
+    pub lease: LeaseParams,
     /// Factor on the velocity limits of the hand's description, (0, 1].
     pub velocity_scale: f64,
     /// Factor on its acceleration limits, (0, 10].
@@ -112,8 +168,8 @@ pub enum ConfigError {
     /// A mapping parameter is not usable.
     #[error(transparent)]
     Mapping(#[from] ParamError),
-    /// A control parameter is out of range.
-    #[error("control.{name} = {value} is not usable: it must be {rule}")]
+    /// A parameter of the loop is out of range.
+    #[error("{name} = {value} is not usable: it must be {rule}")]
     Range {
         /// Name in the file.
         name: &'static str,
@@ -167,40 +223,78 @@ impl Config {
         if let Some(rate) = overrides.rate {
             control.rate_hz = rate;
         }
-        control.check(mapping)
+        control.check(mapping, &file.authority, &file.playout)
     }
 }
 
 impl ControlFile {
-    fn check(&self, mapping: MappingParams) -> Result<Config, ConfigError> {
+    fn check(
+        &self,
+        mapping: MappingParams,
+        authority: &AuthorityFile,
+        playout: &PlayoutFile,
+    ) -> Result<Config, ConfigError> {
         let range = |name, value: f64, from: f64, to: f64, rule| {
             if (from..=to).contains(&value) { Ok(value) } else { Err(ConfigError::Range { name, value, rule }) }
         };
-        let rate = range("rate_hz", self.rate_hz, 20.0, 2000.0, "from 20 to 2000 Hz")?;
-        let hold_after = range("hold_after_s", self.hold_after_s, 0.01, 2.0, "from 0.01 to 2 s")?;
-        let max_age = range("max_age_s", self.max_age_s, 0.01, 5.0, "from 0.01 to 5 s")?;
+        let rate = range("control.rate_hz", self.rate_hz, 20.0, 2000.0, "from 20 to 2000 Hz")?;
+        let seconds = |name, value, from, to, rule| range(name, value, from, to, rule).map(Duration::from_secs_f64);
         Ok(Config {
             mapping,
             control: ControlParams {
                 rate,
-                hold_after: Duration::from_secs_f64(hold_after),
-                smoothing: range("smoothing_s", self.smoothing_s, 0.0, 1.0, "from 0 (off) to 1 s")?,
+                hold_after: seconds("authority.hold_after_s", authority.hold_after_s, 0.01, 2.0, "from 0.01 to 2 s")?,
+                relax: authority.relax,
+                relax_after: seconds(
+                    "authority.relax_after_s",
+                    authority.relax_after_s,
+                    0.1,
+                    86_400.0,
+                    "from 0.1 to 86400 s",
+                )?,
+                stop: authority.stop,
+                smoothing: range("control.smoothing_s", self.smoothing_s, 0.0, 1.0, "from 0 (off) to 1 s")?,
                 engage_speed: range(
-                    "engage_speed_rad_s",
+                    "control.engage_speed_rad_s",
                     self.engage_speed_rad_s,
                     0.05,
                     20.0,
                     "from 0.05 to 20 rad/s",
                 )?,
-                engage_ramp: range("engage_ramp_s", self.engage_ramp_s, 0.0, 30.0, "from 0 to 30 s")?,
-                tip_overlap: range("tip_overlap_m", self.tip_overlap_m, 0.0, 0.1, "from 0 to 0.1 m (no guard)")?,
+                engage_ramp: range("control.engage_ramp_s", self.engage_ramp_s, 0.0, 30.0, "from 0 to 30 s")?,
+                playout: PlayoutParams {
+                    mode: playout.mode,
+                    max_delay: seconds("playout.max_delay_s", playout.max_delay_s, 0.0, 2.0, "from 0 to 2 s")?,
+                    tolerance: seconds("playout.tolerance_s", playout.tolerance_s, 0.0, 1.0, "from 0 to 1 s")?,
+                    predict: seconds("playout.predict_s", playout.predict_s, 0.0, 0.2, "from 0 (off) to 0.2 s")?,
+                },
+                tip_overlap: range(
+                    "control.tip_overlap_m",
+                    self.tip_overlap_m,
+                    0.0,
+                    0.1,
+                    "from 0 to 0.1 m (no guard)",
+                )?,
             },
-            gate: GateParams {
-                max_age: Duration::from_secs_f64(max_age),
-                release_after: Duration::from_secs_f64(hold_after),
+            lease: LeaseParams {
+                max_age: seconds("authority.max_age_s", authority.max_age_s, 0.01, 5.0, "from 0.01 to 5 s")?,
+                release_after: seconds(
+                    "authority.release_after_s",
+                    authority.release_after_s,
+                    0.1,
+                    3600.0,
+                    "from 0.1 to 3600 s",
+                )?,
+                takeover: authority.takeover,
             },
-            velocity_scale: range("velocity_scale", self.velocity_scale, 0.01, 1.0, "from 0.01 to 1")?,
-            acceleration_scale: range("acceleration_scale", self.acceleration_scale, 0.01, 10.0, "from 0.01 to 10")?,
+            velocity_scale: range("control.velocity_scale", self.velocity_scale, 0.01, 1.0, "from 0.01 to 1")?,
+            acceleration_scale: range(
+                "control.acceleration_scale",
+                self.acceleration_scale,
+                0.01,
+                10.0,
+                "from 0.01 to 10",
+            )?,
         })
     }
 }
@@ -292,7 +386,8 @@ mod tests {
                 "mapping.baseline.scale = 0 is not usable: it must be from 0.1 to 10",
             ),
             ("[control]\nrate_hz = 0", "control.rate_hz = 0 is not usable: it must be from 20 to 2000 Hz"),
-            ("[control]\nhold_after_s = nan", "control.hold_after_s = NaN"),
+            ("[authority]\nhold_after_s = nan", "authority.hold_after_s = NaN"),
+            ("[authority]\ntakeover = \"please\"", "expected one of `never`, `idle`, `always`"),
             ("speed = 3", "speed"),
         ] {
             let message = parse(text).unwrap_err().to_string();

@@ -2,7 +2,7 @@
 //!
 //! | module | one line |
 //! |---|---|
-//! | [`control`] | the tick: gate, watchdog, mapping, conditioning; pure |
+//! | [`control`] | the tick: mode, watchdog, mapping, conditioning; pure |
 //! | [`driver`] | the joint interface of a hand; the simulated hand |
 //! | [`runtime`] | the real-time thread around the tick |
 //! | [`receive`] | poses from the network into the slot of the control loop |

@@ -1,14 +1,17 @@
-//! From the network to the control loop: decodes poses, judges them, and leaves the newest good one in the slot.
+//! From the network to the control loop: decodes poses, judges them, and hands the good ones on; stops
+//! and resets go to the latch.
 
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
+use teleop_common::authority::{Claim, Lease, LeaseParams, OperatorName, StopLatch};
 use teleop_common::key::Keys;
 use teleop_common::net::{Arrival, NetError, Session, Subscriber, clock};
 use teleop_common::time::{ClockOffset, Histogram, MonoTime};
-use teleop_common::wire::{Checked, Echo, PoseMessage, REJECTIONS, Rejection};
+use teleop_common::wire::{Checked, ControlMessage, Echo, PoseMessage, REJECTIONS, Rejection, Request};
 
-use crate::control::{Gate, GateParams, PoseSample};
+use crate::control::PoseSample;
+use crate::runtime::Shared;
 
 /// Operators whose clocks are known at the same time: the one that drives and others that try to.
 const CLOCKS: usize = 4;
@@ -16,11 +19,13 @@ const CLOCKS: usize = 4;
 /// Judges arriving poses. Lives behind a mutex on the network's side; the control thread never touches it.
 pub struct Receiver {
     epoch: u64,
-    gate: Gate,
+    lease: Lease,
+    shared: Arc<Shared>,
     clocks: [ClockOffset; CLOCKS],
     next_clock: usize,
-    slot: triple_buffer::Input<Option<PoseSample>>,
+    poses: rtrb::Producer<PoseSample>,
     echo: Echo,
+    operator: OperatorName,
     counts: Counts,
     heard: Option<MonoTime>,
 }
@@ -37,16 +42,18 @@ pub struct Counts {
 }
 
 impl Receiver {
-    /// A receiver of the process `epoch` that fills `slot`.
+    /// A receiver of the process `epoch` that hands good poses on to `poses`.
     #[must_use]
-    pub fn new(epoch: u64, params: GateParams, slot: triple_buffer::Input<Option<PoseSample>>) -> Self {
+    pub fn new(epoch: u64, params: LeaseParams, poses: rtrb::Producer<PoseSample>, shared: Arc<Shared>) -> Self {
         Self {
             epoch,
-            gate: Gate::new(params),
+            lease: Lease::new(params),
+            shared,
             clocks: std::array::from_fn(|_| ClockOffset::default()),
             next_clock: 0,
-            slot,
+            poses,
             echo: Echo::NONE,
+            operator: OperatorName::default(),
             counts: Counts::default(),
             heard: None,
         }
@@ -70,6 +77,33 @@ impl Receiver {
         self.echo
     }
 
+    /// The operator that has the robot at `now`: its epoch and its name.
+    #[must_use]
+    pub fn holder(&self, now: MonoTime) -> Option<(u64, OperatorName)> {
+        self.lease.holder(now).map(|epoch| (epoch, self.operator))
+    }
+
+    /// Takes what arrived on the control key.
+    pub fn on_control(&mut self, arrival: Arrival<'_>) {
+        let Ok(message) = arrival.decode::<ControlMessage>() else { return };
+        let latch: &StopLatch = &self.shared.latch;
+        match message.request() {
+            // From anybody and however old: to hold still is never wrong.
+            Some(Request::Stop) => {
+                if latch.stop() {
+                    tracing::warn!("stop: asked for over the network");
+                }
+            }
+            Some(Request::Reset { stop }) => {
+                let holds = self.lease.holder(arrival.at) == Some(message.header.epoch);
+                if holds && message.robot == self.epoch && latch.reset(stop) {
+                    tracing::warn!("stop {stop}: reset by the operator {:?}", self.operator.as_str());
+                }
+            }
+            None => {}
+        }
+    }
+
     /// Takes what arrived on the pose key.
     pub fn on_pose(&mut self, arrival: Arrival<'_>) {
         self.heard = Some(arrival.at);
@@ -81,7 +115,8 @@ impl Receiver {
             Ok(sample) => {
                 self.counts.accepted += 1;
                 self.counts.age.record(sample.received.since(sample.captured));
-                self.slot.write(Some(sample));
+                // Full: the control thread stands still, and will have newer ones when it runs again.
+                self.poses.push(sample).ok();
             }
             Err(rejection) => self.counts.rejected[rejection.index()] += 1,
         }
@@ -89,12 +124,15 @@ impl Receiver {
 
     fn judge(&mut self, message: &Checked<PoseMessage>, now: MonoTime) -> Result<PoseSample, Rejection> {
         let header = &message.header;
-        if !self.gate.is_open_to(now, header.epoch) {
+        let intent = message.intent();
+        if self.lease.is_open_to(now, header.epoch) {
+            self.echo = Echo::of(header, now);
+        } else if !intent.takeover {
             return Err(Rejection::Operator);
         }
-        self.echo = Echo::of(header, now);
         let own_epoch = self.epoch;
-        let clock = self.clock(header.epoch);
+        let holder = self.lease.holder(now);
+        let clock = self.clock(header.epoch, holder);
         if let Some(exchange) = message.echo.exchange(own_epoch, header, now) {
             // An exchange that makes no sense leaves the estimate as it was.
             clock.update(header.epoch, exchange).ok();
@@ -102,24 +140,39 @@ impl Receiver {
         let known = clock.peer_epoch() == Some(header.epoch);
         let estimate = if known { clock.estimate(now) } else { None };
         let captured = if known { clock.to_own(now, message.captured) } else { None };
+        let sent = if known { clock.to_own(now, header.sent) } else { None };
         let age = if known { clock.age(now, message.captured) } else { None };
         let age = age.zip(estimate).map(|(age, known)| (age as f64 * 1e-9, known.uncertainty.as_secs_f64()));
-        self.gate.admit(now, header.epoch, header.seq, age)?;
+        let claim = Claim {
+            epoch: header.epoch,
+            sequence: header.seq,
+            age,
+            takeover: intent.takeover,
+            leaving: intent.leaving,
+        };
+        self.lease.admit(now, &claim, self.shared.mode().follows())?;
+        self.operator = intent.operator;
         Ok(PoseSample {
             pose: message.pose(),
+            intent,
             epoch: header.epoch,
             sequence: header.seq,
             captured_remote: message.captured,
             captured: captured.unwrap_or(now),
+            sent: sent.unwrap_or(now),
             received: now,
         })
     }
 
-    /// The clock of an operator; an unknown one gets the place of the one that came longest ago.
-    fn clock(&mut self, epoch: u64) -> &mut ClockOffset {
+    /// The clock of an operator; an unknown one gets the place of the one that came longest ago, but never that of the
+    /// operator that has the robot.
+    fn clock(&mut self, epoch: u64, holder: Option<u64>) -> &mut ClockOffset {
         let known = self.clocks.iter().position(|clock| clock.peer_epoch() == Some(epoch));
         let place = known.unwrap_or_else(|| {
-            let place = self.next_clock;
+            let mut place = self.next_clock;
+            if holder.is_some() && self.clocks[place].peer_epoch() == holder {
+                place = (place + 1) % CLOCKS;
+            }
             self.next_clock = (place + 1) % CLOCKS;
             self.clocks[place].reset();
             place
@@ -131,15 +184,15 @@ impl Receiver {
 /// How long nothing may come before the subscription is declared anew.
 const RENEW_EVERY: Duration = Duration::from_secs(1);
 
-/// The subscription that feeds a [`Receiver`].
+/// The subscriptions that feed a [`Receiver`].
 ///
 /// On a link that does not resend (plain UDP) the message that says "I subscribe to this" can get lost, and then no pose
 /// ever comes. So while none comes, the subscription is declared anew.
 pub struct PoseSubscription {
     session: Session,
-    key: String,
+    keys: Keys,
     receiver: Arc<Mutex<Receiver>>,
-    subscriber: Option<Subscriber>,
+    subscribers: Option<[Subscriber; 2]>,
     declared: MonoTime,
 }
 
@@ -150,7 +203,7 @@ impl PoseSubscription {
     /// The session is closed.
     pub fn new(session: &Session, keys: &Keys, receiver: Arc<Mutex<Receiver>>) -> Result<Self, NetError> {
         let mut this =
-            Self { session: session.clone(), key: keys.pose(), receiver, subscriber: None, declared: clock::now() };
+            Self { session: session.clone(), keys: keys.clone(), receiver, subscribers: None, declared: clock::now() };
         this.declare()?;
         Ok(this)
     }
@@ -170,18 +223,22 @@ impl PoseSubscription {
 
     fn declare(&mut self) -> Result<(), NetError> {
         // The old one goes first, so that operators are told of a new one.
-        drop(self.subscriber.take());
-        let receiver = Arc::clone(&self.receiver);
-        let subscriber = self.session.subscribe(&self.key, move |arrival| {
-            receiver.lock().unwrap_or_else(PoisonError::into_inner).on_pose(arrival);
-        })?;
-        self.subscriber = Some(subscriber);
+        drop(self.subscribers.take());
+        let subscribe = |key: &str, take: fn(&mut Receiver, Arrival<'_>)| {
+            let receiver = Arc::clone(&self.receiver);
+            self.session.subscribe(key, move |arrival| {
+                take(&mut receiver.lock().unwrap_or_else(PoisonError::into_inner), arrival);
+            })
+        };
+        let poses = subscribe(&self.keys.pose(), Receiver::on_pose)?;
+        self.subscribers = Some([poses, subscribe(&self.keys.control(), Receiver::on_control)?]);
         Ok(())
     }
 }
 
 #[cfg(test)]
 mod tests {
+    use teleop_common::authority::{Intent, Takeover};
     use teleop_common::master::{Gesture, MasterGeometry, MasterPose};
     use teleop_common::wire::{Header, MAX_MESSAGE, encode_into};
 
@@ -192,10 +249,14 @@ mod tests {
     // The operator's clock is an hour ahead.
     const AHEAD: u64 = 3_600_000 * MS;
 
-    fn receiver() -> (Receiver, triple_buffer::Output<Option<PoseSample>>) {
-        let params = GateParams { max_age: Duration::from_millis(250), release_after: Duration::from_millis(200) };
-        let (input, output) = triple_buffer::triple_buffer(&None);
-        (Receiver::new(ROBOT, params, input), output)
+    fn receiver() -> (Receiver, rtrb::Consumer<PoseSample>) {
+        let params = LeaseParams {
+            max_age: Duration::from_millis(250),
+            release_after: Duration::from_millis(2000),
+            takeover: Takeover::Never,
+        };
+        let (input, output) = rtrb::RingBuffer::new(16);
+        (Receiver::new(ROBOT, params, input, Arc::default()), output)
     }
 
     /// A pose captured and sent at `at` (ms, robot's clock) that arrives 10 ms later, as an answer to a state of the
@@ -209,7 +270,7 @@ mod tests {
         };
         let pose = MasterPose { q: Gesture::Open.sample(0.0), geometry: MasterGeometry::PARADIGMATIC, tuning: None };
         let header = Header::new::<PoseMessage>(epoch, seq, operator(at));
-        let message = PoseMessage::new(header, echo, operator(at), &pose);
+        let message = PoseMessage::new(header, echo, operator(at), &pose, Intent::default());
         deliver(receiver, &message, at + 10);
     }
 
@@ -227,10 +288,10 @@ mod tests {
     fn poses_pass_once_the_clock_is_known() {
         let (mut receiver, mut slot) = receiver();
         send(&mut receiver, 7, 1, 1000, false);
-        assert_eq!((rejected(&receiver, Rejection::Clock), slot.read().is_none()), (1, true));
+        assert_eq!((rejected(&receiver, Rejection::Clock), slot.pop().is_err()), (1, true));
         assert_eq!(receiver.echo().epoch, 7);
         send(&mut receiver, 7, 2, 1010, true);
-        let sample = slot.read().unwrap();
+        let sample = slot.pop().unwrap();
         assert_eq!((sample.epoch, sample.sequence, sample.received), (7, 2, MonoTime(1020 * MS)));
         // Symmetric delays: the capture is known exactly.
         assert!(sample.captured.0.abs_diff(1010 * MS) < 1000, "{:?}", sample.captured);
@@ -248,14 +309,20 @@ mod tests {
         let pose = MasterPose { q: Gesture::Open.sample(0.0), geometry: MasterGeometry::PARADIGMATIC, tuning: None };
         for seq in 2..6 {
             let stamp = MonoTime(AHEAD + (1000 + seq * 20) * MS);
-            let message = PoseMessage::new(Header::new::<PoseMessage>(7, seq, stamp), Echo::NONE, stamp, &pose);
+            let message = PoseMessage::new(
+                Header::new::<PoseMessage>(7, seq, stamp),
+                Echo::NONE,
+                stamp,
+                &pose,
+                Intent::default(),
+            );
             deliver(&mut receiver, &message, 4000 + seq);
         }
         assert_eq!(rejected(&receiver, Rejection::Stale), 4);
-        assert_eq!(slot.read().unwrap().sequence, 1);
+        assert_eq!(slot.pop().unwrap().sequence, 1);
         // The first has been silent for long: the second may drive.
         send(&mut receiver, 8, 2, 4100, true);
-        assert_eq!(slot.read().unwrap().epoch, 8);
+        assert_eq!(slot.pop().unwrap().epoch, 8);
     }
 
     #[test]
@@ -266,8 +333,48 @@ mod tests {
             receiver.on_pose(Arrival { payload: Ok(garbage), at: MonoTime(1011 * MS) });
         }
         assert_eq!(rejected(&receiver, Rejection::Malformed), 4);
-        assert_eq!(slot.read().unwrap().sequence, 1);
+        assert_eq!(slot.pop().unwrap().sequence, 1);
         send(&mut receiver, 7, 2, 1020, true);
-        assert_eq!(slot.read().unwrap().sequence, 2);
+        assert_eq!(slot.pop().unwrap().sequence, 2);
+    }
+
+    fn ask(receiver: &mut Receiver, epoch: u64, robot: u64, request: Request, at: u64) -> bool {
+        let message = ControlMessage::new(Header::new::<ControlMessage>(epoch, 1, MonoTime(at)), robot, request);
+        let mut buffer = [0; MAX_MESSAGE];
+        let len = encode_into(&message, &mut buffer).unwrap();
+        receiver.on_control(Arrival { payload: Ok(&buffer[..len]), at: MonoTime(at * MS) });
+        receiver.shared.latch.get().is_stopped()
+    }
+
+    #[test]
+    fn anybody_may_stop_and_only_the_holder_may_reset() {
+        let (mut receiver, _slot) = receiver();
+        send(&mut receiver, 7, 1, 1000, true);
+        assert!(ask(&mut receiver, 99, 0, Request::Stop, 1100));
+        assert!(ask(&mut receiver, 99, ROBOT, Request::Reset { stop: 1 }, 1101), "not the holder");
+        assert!(ask(&mut receiver, 7, ROBOT + 1, Request::Reset { stop: 1 }, 1102), "meant for another process");
+        assert!(ask(&mut receiver, 7, ROBOT, Request::Reset { stop: 0 }, 1103), "meant for another stop");
+        assert!(!ask(&mut receiver, 7, ROBOT, Request::Reset { stop: 1 }, 1104));
+        assert!(ask(&mut receiver, 99, 0, Request::Stop, 1105));
+        assert!(ask(&mut receiver, 7, ROBOT, Request::Reset { stop: 1 }, 1106), "a replay");
+        receiver.on_control(Arrival { payload: Ok(b"nonsense"), at: MonoTime(1107 * MS) });
+        assert!(receiver.shared.latch.get().is_stopped());
+    }
+
+    #[test]
+    fn strangers_do_not_push_out_the_clock_of_the_holder() {
+        let (mut receiver, mut slot) = receiver();
+        send(&mut receiver, 7, 1, 1000, true);
+        let pose = MasterPose { q: Gesture::Open.sample(0.0), geometry: MasterGeometry::PARADIGMATIC, tuning: None };
+        for epoch in 100..200 {
+            let stamp = MonoTime(AHEAD + 1010 * MS);
+            let intent = Intent { takeover: true, ..Intent::default() };
+            let header = Header::new::<PoseMessage>(epoch, 1, stamp);
+            deliver(&mut receiver, &PoseMessage::new(header, Echo::NONE, stamp, &pose, intent), 1011);
+        }
+        assert_eq!(receiver.echo().epoch, 7);
+        // Without an echo: its clock is still known.
+        send(&mut receiver, 7, 2, 1020, false);
+        assert_eq!(slot.pop().unwrap().sequence, 2);
     }
 }

@@ -11,9 +11,11 @@ use std::time::{Duration, Instant};
 
 use anyhow::Context as _;
 use indicatif::{ProgressBar, ProgressStyle};
+use teleop_common::authority::{Clutch, Intent, Latch};
 use teleop_common::hand::{HandModel, JointVector, TipFrame};
 use teleop_common::mapping::{FingerSignals, MappingOutput, Retargeter};
 use teleop_common::master::MasterPose;
+use teleop_common::mode::Mode;
 use teleop_common::quality::{Quality, Sample};
 use teleop_common::time::MonoTime;
 
@@ -150,6 +152,7 @@ struct Live {
     tick: u64,
     start: Option<f64>,
     sequence: u64,
+    clutch: Clutch,
 }
 
 impl Live {
@@ -163,6 +166,7 @@ impl Live {
             tick: 0,
             start: None,
             sequence: 0,
+            clutch: Clutch::default(),
         })
     }
 
@@ -180,14 +184,20 @@ impl Live {
         let start = *self.start.get_or_insert(t);
         let at = |seconds: f64| MonoTime(((seconds - start) * 1e9).max(0.0) as u64);
         self.sequence += 1;
+        // A recording wants to be followed from the first frame to the last, whatever the gaps.
+        let ready = self.controller.mode() == Mode::Armed || self.controller.mode().follows();
+        self.clutch = if ready { self.clutch.close() } else { self.clutch.open() };
         let sample = PoseSample {
             pose: *pose,
             epoch: 1,
             sequence: self.sequence,
             captured_remote: at(t),
             captured: at(t),
+            sent: at(t),
             received: at(t),
+            intent: Intent { clutch: self.clutch, ..Intent::default() },
         };
+        self.controller.admit(&sample);
         let end = at(next);
         loop {
             let now = MonoTime((self.tick as f64 * 1e9 / self.params.rate) as u64);
@@ -200,7 +210,7 @@ impl Live {
                 self.tick = self.tick.max((end.0 as f64 * 1e-9 * self.params.rate) as u64);
                 continue;
             }
-            let record = self.controller.tick(now, Some(&sample), &self.state);
+            let record = self.controller.tick(now, Latch::default(), &self.state);
             self.before = self.state.q;
             self.state.q = record.command.q;
             self.state.dq = record.command.dq;

@@ -4,18 +4,20 @@
 //! |---|---|
 //! | control | its next deadline, or the hand's next frame; nothing else |
 //!
-//! Poses come in through a triple buffer (the newest wins), records go out through a ring that drops when nobody
-//! reads. Neither blocks, so no network, viewer or logger can delay a tick.
+//! Poses come in through a ring that drops the newest when nobody takes them, stops through an atomic number, records go out through a ring
+//! that drops when nobody reads. None blocks, so no network, viewer or logger can delay a tick.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU8, AtomicU64, Ordering};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
 use rustix::thread::clock_nanosleep_absolute;
 use rustix::time::{ClockId, Timespec};
+use teleop_common::authority::StopLatch;
 use teleop_common::hand::JointVector;
+use teleop_common::mode::Mode;
 use teleop_common::net::clock::now;
 use teleop_common::time::MonoTime;
 use thread_priority::{
@@ -30,6 +32,8 @@ use crate::driver::{DriverError, HandDriver, JointState, Pace};
 const HAND_TIMEOUT: Duration = Duration::from_millis(50);
 /// Places in the ring of records: 1.5 s at 333 Hz.
 const RECORDS: usize = 512;
+/// Places for poses: a third of a second at 200 Hz, far more than come between two ticks.
+const POSES: usize = 64;
 
 /// Whether the control thread must get real-time priority.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
@@ -43,6 +47,22 @@ pub enum Realtime {
     Off,
 }
 
+/// What the control thread and all others may read and write at any time.
+#[derive(Debug, Default)]
+pub struct Shared {
+    /// Stops and their resets.
+    pub latch: StopLatch,
+    mode: AtomicU8,
+}
+
+impl Shared {
+    /// The mode after the last tick.
+    #[must_use]
+    pub fn mode(&self) -> Mode {
+        Mode::from_wire(self.mode.load(Ordering::Relaxed)).unwrap_or_default()
+    }
+}
+
 /// A tick and how it went in time.
 #[derive(Clone, Copy, Debug)]
 pub struct LoopRecord {
@@ -50,6 +70,8 @@ pub struct LoopRecord {
     pub record: TickRecord,
     /// How late it began.
     pub late: Duration,
+    /// When the command was written.
+    pub written: MonoTime,
     /// How long it took, from the state to the command written.
     pub busy: Duration,
     /// Deadlines missed so far.
@@ -61,9 +83,11 @@ pub struct LoopRecord {
 /// The network's end of the control thread.
 pub struct Link {
     /// Where admitted poses go.
-    pub poses: triple_buffer::Input<Option<PoseSample>>,
+    pub poses: rtrb::Producer<PoseSample>,
     /// Where records come from.
     pub records: rtrb::Consumer<LoopRecord>,
+    /// The stop latch and the mode.
+    pub shared: Arc<Shared>,
 }
 
 /// The running control thread.
@@ -107,9 +131,10 @@ impl ControlThread {
     ) -> Result<(Self, Link), StartError> {
         let name = driver.name();
         driver.start().map_err(|source| StartError::Driver { name, source })?;
-        let (input, output) = triple_buffer::triple_buffer(&None);
+        let (input, output) = rtrb::RingBuffer::new(POSES);
         let (producer, consumer) = rtrb::RingBuffer::new(RECORDS);
         let (stop, dropped) = (Arc::new(AtomicBool::new(false)), Arc::new(AtomicU64::new(0)));
+        let shared = Arc::new(Shared::default());
         let (ready, started) = std::sync::mpsc::sync_channel(1);
         let mut body = Loop {
             controller,
@@ -117,6 +142,7 @@ impl ControlThread {
             poses: output,
             records: producer,
             stop: Arc::clone(&stop),
+            shared: Arc::clone(&shared),
             dropped: Arc::clone(&dropped),
             period: Duration::from_secs_f64(1.0 / rate),
             overruns: 0,
@@ -136,7 +162,7 @@ impl ControlThread {
             return Err(StartError::Priority(reason.clone()));
         }
         let this = Self { stop, dropped, thread: Some(thread), realtime: priority.is_ok() };
-        Ok((this, Link { poses: input, records: consumer }))
+        Ok((this, Link { poses: input, records: consumer, shared }))
     }
 
     /// True if the thread has real-time priority.
@@ -181,9 +207,10 @@ fn raise_priority() -> Result<(), String> {
 struct Loop {
     controller: Controller,
     driver: Box<dyn HandDriver>,
-    poses: triple_buffer::Output<Option<PoseSample>>,
+    poses: rtrb::Consumer<PoseSample>,
     records: rtrb::Producer<LoopRecord>,
     stop: Arc<AtomicBool>,
+    shared: Arc<Shared>,
     dropped: Arc<AtomicU64>,
     period: Duration,
     overruns: u64,
@@ -216,16 +243,23 @@ impl Loop {
                 }
             }
             let start = now();
-            let record = self.controller.tick(start, self.poses.read().as_ref(), &state);
+            for _ in 0..POSES {
+                let Ok(sample) = self.poses.pop() else { break };
+                self.controller.admit(&sample);
+            }
+            let record = self.controller.tick(start, self.shared.latch.get(), &state);
+            self.shared.mode.store(record.mode.to_wire(), Ordering::Relaxed);
             if self.driver_error.is_none()
                 && let Err(error) = self.driver.write(&record.command)
             {
                 self.fail(error);
             }
+            let written = now();
             let record = LoopRecord {
                 record,
+                written,
                 late: begun.map_or(Duration::ZERO, |begun| begun.since(deadline)),
-                busy: now().since(begun.unwrap_or(start)),
+                busy: written.since(begun.unwrap_or(start)),
                 overruns: self.overruns,
                 driver_error: self.driver_error,
             };

@@ -11,7 +11,8 @@ use teleop_common::net::{NetError, Publisher, Session, Stream, clock};
 use teleop_common::time::{Histogram, MonoTime};
 use teleop_common::viz::{Level, Logger, RobotFrame};
 use teleop_common::wire::{
-    HealthMessage, JointStateMessage, MappingMessage, Quantiles, REJECTIONS, Rejection, Stamper, pack_joints,
+    HealthMessage, JointStateMessage, MappingMessage, Quantiles, REJECTIONS, Rejection, STAGES, Stage, Stamper,
+    latency_report, pack_joints,
 };
 
 use crate::control::Fault;
@@ -40,6 +41,10 @@ pub struct Telemetry {
     // Counters at the last change of mode.
     rejected: [u64; REJECTIONS],
     tick_times: Histogram,
+    stages: [Histogram; STAGES],
+    total: Histogram,
+    // Epoch and sequence of the newest pose in them.
+    staged: Option<(u64, u64)>,
     slowest: Duration,
     // Tick number and time of the last health message, for the measured rate.
     rate_mark: Option<(u64, MonoTime)>,
@@ -75,6 +80,9 @@ impl Telemetry {
             mode: None,
             rejected: [0; REJECTIONS],
             tick_times: Histogram::default(),
+            stages: [Histogram::default(); STAGES],
+            total: Histogram::default(),
+            staged: None,
             slowest: Duration::ZERO,
             rate_mark: None,
         })
@@ -84,6 +92,7 @@ impl Telemetry {
     pub fn on_record(&mut self, record: &LoopRecord, dropped: u64) {
         self.tick_times.record(record.busy);
         self.slowest = self.slowest.max(record.busy);
+        self.measure_stages(record);
         let now = record.record.now;
         if self.mode != Some(record.record.mode) {
             self.tell_mode(record);
@@ -108,7 +117,10 @@ impl Telemetry {
     fn publish_state(&mut self, record: &LoopRecord) {
         let tick = &record.record;
         let sample = tick.sample.as_ref();
-        let echo = self.receiver.lock().unwrap_or_else(PoisonError::into_inner).echo();
+        let (echo, holder) = {
+            let receiver = self.receiver.lock().unwrap_or_else(PoisonError::into_inner);
+            (receiver.echo(), receiver.holder(clock::now()))
+        };
         let message = JointStateMessage {
             header: self.joints.1.header::<JointStateMessage>(clock::now()),
             echo,
@@ -123,6 +135,8 @@ impl Telemetry {
             dq: pack_joints(&tick.state.dq),
             tau: pack_joints(&tick.state.tau),
             q_command: pack_joints(&tick.command.q),
+            stop: tick.latch.asked,
+            holder: holder.map_or(0, |(epoch, _)| epoch),
         };
         told_once(self.joints.0.send(&message));
         if let Some(mapping) = &tick.mapping {
@@ -140,7 +154,10 @@ impl Telemetry {
             if seconds > 0.0 { (tick.tick - ticks) as f64 / seconds } else { 0.0 }
         });
         self.rate_mark = Some((tick.tick, tick.now));
-        let counts = self.receiver.lock().unwrap_or_else(PoisonError::into_inner).counts().clone();
+        let (counts, holder) = {
+            let receiver = self.receiver.lock().unwrap_or_else(PoisonError::into_inner);
+            (receiver.counts().clone(), receiver.holder(clock::now()))
+        };
         let message = HealthMessage {
             header: self.health.1.header::<HealthMessage>(clock::now()),
             mode: tick.mode.to_wire(),
@@ -154,8 +171,33 @@ impl Telemetry {
             age_ms: Quantiles::of(&counts.age, 1e-3),
             telemetry_dropped: dropped,
             rate_hz: rate as f32,
+            operator: holder.map(|(_, name)| name).unwrap_or_default(),
+            stages: self.stages.each_ref().map(|stage| Quantiles::of(stage, 1e-3)),
+            total_ms: Quantiles::of(&self.total, 1e-3),
         };
         told_once(self.health.0.send(&message));
+    }
+
+    /// Counts how long the pose that this tick was the first to use was on its way.
+    fn measure_stages(&mut self, record: &LoopRecord) {
+        let Some(sample) = record.record.sample.as_ref() else { return };
+        let key = Some((sample.epoch, sample.sequence));
+        if self.staged == key {
+            return;
+        }
+        self.staged = key;
+        let stamps = [sample.captured, sample.sent, sample.received, record.record.now, record.written];
+        for (stage, pair) in Stage::ALL.into_iter().zip(stamps.windows(2)) {
+            self.stages[stage as usize].record(pair[1].since(pair[0]));
+        }
+        self.total.record(record.written.since(sample.captured));
+    }
+
+    /// Where the time goes from the human hand to the robot hand, for people; `None` if no pose was obeyed.
+    #[must_use]
+    pub fn latency_report(&self) -> Option<String> {
+        let ms = |histogram| Quantiles::of(histogram, 1e-3);
+        (self.total.count() > 0).then(|| latency_report(&self.stages.each_ref().map(ms), &ms(&self.total)))
     }
 
     fn view(&mut self, record: &LoopRecord) {
@@ -190,13 +232,20 @@ impl Telemetry {
         let tick = &record.record;
         self.mode = Some(tick.mode);
         let (level, text) = match tick.mode {
-            Mode::Idle => (Level::Info, "idle: waiting for an operator".to_owned()),
+            Mode::Disarmed => (Level::Info, "disarmed: no operator has the robot".to_owned()),
+            Mode::Armed => {
+                let name = tick.sample.map(|sample| sample.intent.operator).unwrap_or_default();
+                let operator = tick.sample.map_or(0, |sample| sample.epoch);
+                (Level::Info, format!("armed: operator {name} ({operator:016x}) has the robot, its clutch is open"))
+            }
+            Mode::Engaging => (Level::Info, "engaging: the clutch is closed".to_owned()),
             Mode::Engaged => {
                 self.refusals();
-                let operator = tick.sample.map_or(0, |sample| sample.epoch);
-                (Level::Info, format!("engaged: following operator {operator:016x}"))
+                (Level::Info, "engaged: following the operator".to_owned())
             }
             Mode::Holding => (Level::Warn, format!("holding: no fresh pose{}", self.refusals())),
+            Mode::Relaxed => (Level::Warn, "relaxed: the hold lasts".to_owned()),
+            Mode::Stopped => (Level::Warn, format!("stopped: stop {} is in force until it is reset", tick.latch.asked)),
             Mode::Faulted => {
                 let why = match (tick.fault, record.driver_error) {
                     (Fault::Driver, Some(error)) => error.to_string(),

@@ -186,7 +186,7 @@ impl Probe {
 /// How many measured joints covered more than `angle` (rad) while the robot followed.
 #[must_use]
 pub fn moved(states: &[State], angle: f64) -> usize {
-    let engaged = || states.iter().filter(|state| state.mode() == Some(Mode::Engaged)).map(|state| state.q());
+    let engaged = || states.iter().filter(|state| state.mode().is_some_and(Mode::follows)).map(|state| state.q());
     let Some(first) = engaged().next() else { return 0 };
     let covered = |joint: usize| {
         let (low, high) = engaged()

@@ -112,10 +112,12 @@ impl Process {
         Self { name: format!("{name} {}", arguments.join(" ")), child, stdout, stderr }
     }
 
-    /// An operator that streams `source` to the robot at `endpoint`, without viewer.
+    /// An operator that streams `source` to the robot at `endpoint`, without viewer, and closes the clutch whenever the
+    /// robot is ready.
     #[must_use]
     pub fn operator(endpoint: &str, source: &str, more: &[&str]) -> Self {
-        let mut arguments = vec!["run", "--viewer", "off", "--connect", endpoint, "--source", source];
+        let mut arguments =
+            vec!["run", "--viewer", "off", "--clutch", "auto", "--connect", endpoint, "--source", source];
         arguments.extend(more);
         Self::start("operator", &arguments)
     }

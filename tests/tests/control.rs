@@ -8,6 +8,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
+use teleop_common::authority::{Clutch, Intent, Latch, LeaseParams, Takeover};
 use teleop_common::hand::{HandModel, HandSide, JointVector};
 use teleop_common::mapping::{MappingMode, MappingParams};
 use teleop_common::master::{Gesture, MasterGeometry, MasterPose};
@@ -15,10 +16,10 @@ use teleop_common::mode::Mode;
 use teleop_common::net::Arrival;
 use teleop_common::time::MonoTime;
 use teleop_common::wire::{Echo, MAX_MESSAGE, PoseMessage, Stamper, encode_into};
-use teleop_robot::control::{ControlParams, Controller, Fault, GateParams, PoseSample, TickRecord};
+use teleop_robot::control::{ControlParams, Controller, Fault, PoseSample, TickRecord};
 use teleop_robot::driver::{DriverError, HandDriver, JointCommand, JointState, Pace, SimHand};
 use teleop_robot::receive::Receiver;
-use teleop_robot::runtime::{ControlThread, Realtime};
+use teleop_robot::runtime::{ControlThread, Realtime, Shared};
 use teleop_tests::eventually;
 use teleop_tests::relay::Dice;
 
@@ -69,6 +70,8 @@ const MS: u64 = 1_000_000;
 const RATE: f64 = 333.0;
 const PERIOD: Duration = Duration::from_nanos(3_003_003);
 const HOLD_AFTER: Duration = Duration::from_millis(200);
+/// Longest allowance for the period of the source.
+const MAX_PERIOD: Duration = Duration::from_millis(100);
 
 /// A controller and a simulated hand that tick in virtual time.
 struct Bench {
@@ -76,6 +79,10 @@ struct Bench {
     controller: Controller,
     driver: SimHand,
     now: MonoTime,
+    latch: Latch,
+    clutch: Clutch,
+    /// Whether the operator closes the clutch whenever the robot is ready.
+    eager: bool,
 }
 
 impl Bench {
@@ -85,7 +92,15 @@ impl Bench {
         let mut driver = SimHand::new(&hand, 1.0 / RATE);
         driver.start().unwrap();
         let controller = Controller::new(hand.clone(), mapping, params).unwrap();
-        Self { hand, controller, driver, now: MonoTime(MS) }
+        Self {
+            hand,
+            controller,
+            driver,
+            now: MonoTime(MS),
+            latch: Latch::default(),
+            clutch: Clutch::default(),
+            eager: true,
+        }
     }
 
     fn right() -> Self {
@@ -95,15 +110,39 @@ impl Bench {
     fn tick(&mut self, newest: Option<&PoseSample>) -> TickRecord {
         self.now = self.now + PERIOD;
         let state = self.driver.read(Duration::ZERO).unwrap();
-        let record = self.controller.tick(self.now, newest, &state);
+        if let Some(sample) = newest {
+            self.controller.admit(sample);
+        }
+        let record = self.controller.tick(self.now, self.latch, &state);
         self.driver.write(&record.command).unwrap();
         record
     }
 
     /// A pose that arrives now.
-    fn sample(&self, pose: MasterPose, sequence: u64) -> PoseSample {
-        PoseSample { pose, epoch: 7, sequence, captured_remote: self.now, captured: self.now, received: self.now }
+    fn sample(&mut self, pose: MasterPose, sequence: u64) -> PoseSample {
+        if self.eager {
+            self.clutch = eager(self.clutch, self.controller.mode());
+        }
+        PoseSample {
+            pose,
+            intent: self.intent(),
+            epoch: 7,
+            sequence,
+            captured_remote: self.now,
+            captured: self.now,
+            sent: self.now,
+            received: self.now,
+        }
     }
+
+    fn intent(&self) -> Intent {
+        Intent { clutch: self.clutch, ..Intent::default() }
+    }
+}
+
+/// The clutch of an operator that closes it whenever the robot is ready, and sees at once what the robot does.
+fn eager(clutch: Clutch, mode: Mode) -> Clutch {
+    if mode == Mode::Armed || mode.follows() { clutch.close() } else { clutch.open() }
 }
 
 fn pose(gesture: Gesture, t: f64) -> MasterPose {
@@ -129,9 +168,10 @@ fn assert_no_allocation(mapping: MappingParams) {
     const AHEAD: u64 = 3_600_000 * MS;
     let mode = mapping.mode;
     let mut bench = Bench::new(HandSide::Right, mapping);
-    let (input, mut slot) = triple_buffer::triple_buffer(&None);
-    let gate = GateParams { max_age: Duration::from_millis(250), release_after: HOLD_AFTER };
-    let mut receiver = Receiver::new(ROBOT, gate, input);
+    let (input, mut poses) = rtrb::RingBuffer::new(16);
+    let lease =
+        LeaseParams { max_age: Duration::from_millis(250), release_after: HOLD_AFTER, takeover: Takeover::Idle };
+    let mut receiver = Receiver::new(ROBOT, lease, input, Arc::<Shared>::default());
     let mut operator = Stamper::new(100);
     let mut modes = [0_u64; Mode::ALL.len()];
     let mut run = |ticks: u64| {
@@ -147,14 +187,18 @@ fn assert_no_allocation(mapping: MappingParams) {
                 let echo = Echo { epoch: ROBOT, sent: MonoTime(sent - 3 * MS), received: MonoTime(sent - MS + AHEAD) };
                 let header = operator.header::<PoseMessage>(MonoTime(sent + AHEAD));
                 let pose = pose(Gesture::Tour, tick as f64 / RATE);
-                let message = PoseMessage::new(header, echo, MonoTime(sent + AHEAD), &pose);
+                let message = PoseMessage::new(header, echo, MonoTime(sent + AHEAD), &pose, bench.intent());
                 let mut bytes = [0; MAX_MESSAGE];
                 let len = encode_into(&message, &mut bytes).unwrap();
                 receiver.on_pose(Arrival { payload: Ok(&bytes[..len]), at: MonoTime(arrives) });
                 // And what is no pose.
                 receiver.on_pose(Arrival { payload: Ok(&bytes[..len - 1]), at: MonoTime(arrives) });
             }
-            let record = bench.tick(slot.read().as_ref());
+            while let Ok(sample) = poses.pop() {
+                bench.controller.admit(&sample);
+            }
+            bench.clutch = eager(bench.clutch, bench.controller.mode());
+            let record = bench.tick(None);
             modes[record.mode as usize] += 1;
         }
     };
@@ -166,7 +210,10 @@ fn assert_no_allocation(mapping: MappingParams) {
     );
     assert_eq!(count, 0);
     // It was the real thing: followed, held, and followed again.
-    assert!(modes[Mode::Engaged as usize] > 90_000 && modes[Mode::Holding as usize] > 500, "{modes:?}");
+    assert!(
+        modes[Mode::Engaged as usize] + modes[Mode::Engaging as usize] > 90_000 && modes[Mode::Holding as usize] > 500,
+        "{modes:?}"
+    );
     assert_eq!(modes[Mode::Faulted as usize], 0);
     assert!(receiver.counts().accepted > 30_000, "{:?}", receiver.counts().rejected);
     // And the counter counts.
@@ -176,26 +223,29 @@ fn assert_no_allocation(mapping: MappingParams) {
 #[test]
 fn the_watchdog_holds_within_a_tick() {
     let mut bench = Bench::right();
-    let (mut sample, mut engaged) = (None, 0);
+    let (mut sample, mut follows) = (None, 0);
     for tick in 0..600 {
         if tick % 3 == 0 {
             sample = Some(bench.sample(pose(Gesture::Wave, f64::from(tick) / RATE), tick as u64));
         }
-        engaged += u32::from(bench.tick(sample.as_ref()).mode == Mode::Engaged);
+        follows += u32::from(bench.tick(sample.as_ref()).mode.follows());
     }
-    assert_eq!(engaged, 600);
+    // The first pose arms the hand, the second closes the clutch.
+    assert_eq!(follows, 597);
+    // Poses come every third tick.
+    let patience = HOLD_AFTER + 3 * PERIOD;
     let received = sample.unwrap().received;
     // The same pose again and again is no fresh pose.
     let first = loop {
         let record = bench.tick(sample.as_ref());
-        if record.mode != Mode::Engaged {
+        if !record.mode.follows() {
             break record;
         }
-        assert!(record.now.since(received) <= HOLD_AFTER);
+        assert!(record.now.since(received) <= patience);
     };
     assert_eq!((first.mode, first.holds), (Mode::Holding, 1));
     let silent = first.now.since(received);
-    assert!(silent > HOLD_AFTER && silent <= HOLD_AFTER + PERIOD, "{silent:?}");
+    assert!(silent > patience && silent <= patience + PERIOD, "{silent:?}");
 
     // It brakes within 7 / 120 s, then the command is exactly still and the hand comes to rest.
     for _ in 0..20 {
@@ -233,7 +283,13 @@ fn it_resumes_without_a_jump() {
     for tick in 0..600_u32 {
         let sample = bench.sample(pose(Gesture::Open, 0.0), 1000 + u64::from(tick));
         let record = bench.tick(Some(&sample));
-        assert_eq!(record.mode, Mode::Engaged);
+        // One tick to see that the clutch is open again, one until it is closed.
+        let expected = match tick {
+            0 => Mode::Armed,
+            1..=333 => Mode::Engaging,
+            _ => Mode::Engaged,
+        };
+        assert_eq!(record.mode, expected, "at tick {tick}");
         let speed = speed(&before, &record);
         let ramp = 1.0 + 9.0 * f64::from(tick) / RATE;
         assert!(speed <= ramp.min(7.0) + 1e-9, "{speed} rad/s at tick {tick}");
@@ -298,7 +354,7 @@ fn no_stream_of_poses_breaks_a_limit() {
                 bench.now = bench.now + Duration::from_millis((dice.roll() * 300.0) as u64);
             }
             let record = bench.tick(sample.as_ref());
-            assert!(matches!(record.mode, Mode::Engaged | Mode::Holding), "{record:?}");
+            assert!(!matches!(record.mode, Mode::Stopped | Mode::Faulted | Mode::Relaxed), "{record:?}");
             for (slot, joint) in bench.hand.joints.iter().enumerate() {
                 let (q, tau) = (record.command.q[slot], record.command.tau[slot]);
                 assert!((joint.lower..=joint.upper).contains(&q), "{} at {q}", joint.name);
@@ -341,7 +397,8 @@ fn faults_take_the_torque_off_for_good() {
         let mut state = bench.driver.read(Duration::ZERO).unwrap();
         change(&mut state);
         let sample = bench.sample(pose(Gesture::Wave, 1.3), 1000);
-        let record = bench.controller.tick(bench.now + PERIOD, Some(&sample), &state);
+        bench.controller.admit(&sample);
+        let record = bench.controller.tick(bench.now + PERIOD, Latch::default(), &state);
         assert_eq!((record.mode, record.fault), (Mode::Faulted, Fault::StateInvalid));
         assert!(record.command.tau.iter().all(|tau| *tau == 0.0), "{:?}", record.command.tau);
         // A hand with a position controller of its own must not get it either.

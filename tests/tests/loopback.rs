@@ -7,6 +7,7 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
+use teleop_common::authority::Intent;
 use teleop_common::key::Keys;
 use teleop_common::master::{MasterGeometry, MasterPose};
 use teleop_common::net::{NetError, Publisher, Session, SessionConfig, Stream, Subscriber, clock};
@@ -92,7 +93,7 @@ impl Operator {
     fn send(&mut self) {
         let now = clock::now();
         let header = self.stamper.header::<PoseMessage>(now);
-        self.publisher.send(&PoseMessage::new(header, Echo::NONE, now, &POSE)).unwrap();
+        self.publisher.send(&PoseMessage::new(header, Echo::NONE, now, &POSE, Intent::default())).unwrap();
     }
 }
 
@@ -173,7 +174,13 @@ fn garbage_is_counted_and_disturbs_nothing() {
     eventually("the robot listens to both", || operator.publisher.has_subscribers() && vandal.has_subscribers());
 
     let mut valid = [0; 1024];
-    let message = PoseMessage::new(Stamper::new(9).header::<PoseMessage>(MonoTime(1)), Echo::NONE, MonoTime(1), &POSE);
+    let message = PoseMessage::new(
+        Stamper::new(9).header::<PoseMessage>(MonoTime(1)),
+        Echo::NONE,
+        MonoTime(1),
+        &POSE,
+        Intent::default(),
+    );
     let len = teleop_common::wire::encode_into(&message, &mut valid).unwrap();
     let mut nan = valid;
     nan[64..68].copy_from_slice(&f32::NAN.to_le_bytes());
@@ -306,7 +313,7 @@ fn udp_with_delay_jitter_and_loss() {
             let now = operator.now();
             let echo = operator.state.lock().unwrap().echo;
             let header = pose_stamps.header::<PoseMessage>(now);
-            poses.send(&PoseMessage::new(header, echo, now, &POSE)).unwrap();
+            poses.send(&PoseMessage::new(header, echo, now, &POSE, Intent::default())).unwrap();
 
             let echo = robot.state.lock().unwrap().echo;
             let message = JointStateMessage {
@@ -426,6 +433,9 @@ fn an_invalid_message_is_not_sent() {
         age_ms: Default::default(),
         telemetry_dropped: 0,
         rate_hz: 333.0,
+        operator: Default::default(),
+        stages: Default::default(),
+        total_ms: Default::default(),
     };
     publisher.send(&message).unwrap();
     message.rate_hz = f32::NAN;

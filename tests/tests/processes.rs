@@ -6,6 +6,7 @@
 
 use std::time::Duration;
 
+use teleop_common::authority::{Clutch, Intent};
 use teleop_common::hand::{HandModel, HandSide};
 use teleop_common::master::{Gesture, MasterGeometry, MasterPose};
 use teleop_common::mode::Mode;
@@ -19,7 +20,9 @@ use teleop_tests::{PATIENCE, eventually};
 
 const RATE: f64 = 333.0;
 /// The robot's defaults, s.
-const HOLD_AFTER: f64 = 0.2;
+const HOLD_AFTER: f64 = 0.1;
+/// The operator's period, s.
+const PERIOD: f64 = 0.01;
 const MAX_AGE: f64 = 0.25;
 /// States carry angles as f32.
 const RESOLUTION: f64 = 2.5e-7;
@@ -32,12 +35,16 @@ fn is(mode: Mode) -> impl Fn(&State) -> bool {
     move |state| state.mode() == Some(mode)
 }
 
+fn follows(state: &State) -> bool {
+    state.mode().is_some_and(Mode::follows)
+}
+
 /// Waits until the robot follows an operator other than `former`, and gives its epoch.
 #[track_caller]
 fn follows_another(probe: &Probe, former: u64) -> u64 {
     let mut epoch = 0;
     eventually("the robot follows another operator", || {
-        epoch = probe.last().filter(is(Mode::Engaged)).map_or(0, |state| state.pose_epoch);
+        epoch = probe.last().filter(follows).map_or(0, |state| state.pose_epoch);
         epoch != 0 && epoch != former
     });
     epoch
@@ -62,7 +69,7 @@ fn the_hand_moves_whoever_starts_first() {
     // The robot first.
     let mut robot = Robot::start(&[]);
     let probe = Probe::connect(robot.endpoint());
-    probe.wait_for(Mode::Idle);
+    probe.wait_for(Mode::Disarmed);
     let describe = probe.session.get(&probe.keys.describe(), PATIENCE).unwrap();
     let describe: serde_json::Value = serde_json::from_slice(&describe).unwrap();
     assert_eq!((describe["joints"].as_array().unwrap().len(), &describe["hand"]), (16, &"right".into()));
@@ -110,9 +117,11 @@ fn signals_end_both_cleanly() {
         assert_eq!(probe.keys.live_epoch(&operators()[0]), epoch, "the token names the one that is followed");
         operator.stop(signal);
         eventually("the operator's token is gone", || operators().is_empty());
-        let holding = probe.wait_for(Mode::Holding);
+        // It gave the robot back, so nothing was missing.
+        let ended = probe.wait_for(Mode::Disarmed);
         probe.wait_for_more(80);
-        assert_still(&probe.since(holding));
+        assert_still(&probe.since(ended));
+        assert_eq!(probe.health().unwrap().holds, 0);
         robot.process.stop(signal);
         eventually("the robot's token is gone", || probe.robots().is_empty());
         assert!(robot.process.stderr().contains("stopped"), "{}", robot.process.stderr());
@@ -135,8 +144,8 @@ fn a_killed_operator_leaves_the_hand_still_and_the_next_one_goes_on() {
     let last_pose = states[holding].pose_seq;
     let obeyed = states.iter().find(|state| state.pose_epoch == epoch && state.pose_seq == last_pose).unwrap();
     let ticks = states[holding].tick - obeyed.tick;
-    println!("holding {ticks} ticks after the last pose, nominal {:.0}", HOLD_AFTER * RATE);
-    assert!(ticks as f64 <= HOLD_AFTER * RATE + 6.0, "holding {ticks} ticks after the last pose");
+    println!("holding {ticks} ticks after the last pose, nominal {:.0}", (HOLD_AFTER + PERIOD) * RATE);
+    assert!(ticks as f64 <= (HOLD_AFTER + PERIOD) * RATE + 6.0, "holding {ticks} ticks after the last pose");
     let end = states[holding..].iter().position(|state| !is(Mode::Holding)(state));
     assert_eq!(end, None, "it stays so");
     assert_still(&states[holding..]);
@@ -151,7 +160,7 @@ fn a_killed_operator_leaves_the_hand_still_and_the_next_one_goes_on() {
     println!("killed and replaced: {extremes:?}");
 
     // It starts from where it stood, slowly: 1 rad/s at first, ten times that after a second.
-    let resumed = holding + states[holding..].iter().position(is(Mode::Engaged)).unwrap();
+    let resumed = holding + states[holding..].iter().position(follows).unwrap();
     let start = states[resumed].tick;
     for pair in commands(&states[resumed - 1..]).windows(2).take_while(|pair| pair[1].tick < start + 300) {
         let ticks = (pair[1].tick - pair[0].tick) as f64;
@@ -185,7 +194,7 @@ fn a_stopped_operator_delivers_nothing_stale() {
     // thread that a busy machine keeps waiting.
     let oldest = states[woken..]
         .iter()
-        .filter(|state| is(Mode::Engaged)(state))
+        .filter(|state| follows(state))
         .map(|state| state.header.sent.since(state.pose_captured).as_secs_f64())
         .fold(0.0, f64::max);
     println!("oldest pose obeyed after the stop: {:.0} ms", oldest * 1e3);
@@ -216,7 +225,7 @@ fn a_killed_robot_is_found_again_when_it_restarts() {
 #[test]
 fn a_second_operator_waits_for_the_first_to_end() {
     // Long enough that a busy machine does not keep the first one silent for it.
-    let (folder, config) = config("[control]\nhold_after_s = 1.5\nmax_age_s = 1.5");
+    let (folder, config) = config("[authority]\nhold_after_s = 1.5\nmax_age_s = 1.5");
     let robot = Robot::start(&["--config", &config]);
     let probe = Probe::connect(robot.endpoint());
     let mut first = Process::operator(robot.endpoint(), "wave", &[]);
@@ -227,7 +236,7 @@ fn a_second_operator_waits_for_the_first_to_end() {
     eventually("the second is refused", || probe.rejected(Rejection::Operator) > 100);
     probe.wait_for_more(50);
     for state in probe.since(before) {
-        assert_eq!((state.mode(), state.pose_epoch), (Some(Mode::Engaged), epoch), "at tick {}", state.tick);
+        assert_eq!((follows(&state), state.pose_epoch), (true, epoch), "at tick {}", state.tick);
     }
     first.stop(Signal::Term);
     follows_another(&probe, epoch);
@@ -239,13 +248,14 @@ fn a_second_operator_waits_for_the_first_to_end() {
 
 #[test]
 fn garbage_disturbs_nothing() {
-    let (folder, config) = config("[control]\nhold_after_s = 1.5\nmax_age_s = 1.5");
+    let (folder, config) = config("[authority]\nhold_after_s = 1.5\nmax_age_s = 1.5");
     let robot = Robot::start(&["--config", &config]);
     let probe = Probe::connect(robot.endpoint());
     // Before anybody drives: none of it may move the hand.
     let vandal = probe.session.publisher(&probe.keys.pose(), Stream::Slow).unwrap();
     eventually("the robot listens", || vandal.has_subscribers());
     let pose = MasterPose { q: Gesture::Fist.sample(1.0), geometry: MasterGeometry::PARADIGMATIC, tuning: None };
+    let intent = Intent { clutch: Clutch(1), takeover: true, ..Intent::default() };
     let mut stamper = Stamper::new(13);
     let mut throw = || {
         let now = clock::now();
@@ -253,7 +263,7 @@ fn garbage_disturbs_nothing() {
         // An echo of a robot that is not there, and one out of the future.
         let echo = Echo { epoch: 99, sent: MonoTime(now.0 + 1), received: MonoTime(u64::MAX) };
         let mut bytes = [0; MAX_MESSAGE];
-        let len = encode_into(&PoseMessage::new(header, echo, now, &pose), &mut bytes).unwrap();
+        let len = encode_into(&PoseMessage::new(header, echo, now, &pose, intent), &mut bytes).unwrap();
         let mut version = bytes;
         version[4] ^= 0x40;
         let mut nan = bytes;
@@ -273,7 +283,7 @@ fn garbage_disturbs_nothing() {
             && probe.rejected(Rejection::Value) >= 40
             && probe.rejected(Rejection::Clock) >= 40
     });
-    assert!(probe.states().iter().all(is(Mode::Idle)));
+    assert!(probe.states().iter().all(is(Mode::Disarmed)));
 
     let mut operator = Process::operator(robot.endpoint(), "wave", &[]);
     probe.wait_for(Mode::Engaged);
@@ -284,7 +294,7 @@ fn garbage_disturbs_nothing() {
     probe.wait_for_motion(0.2);
     let driver = probe.last().unwrap().pose_epoch;
     for state in probe.since(engaged) {
-        assert_eq!((state.mode(), state.pose_epoch), (Some(Mode::Engaged), driver), "at tick {}", state.tick);
+        assert_eq!((follows(&state), state.pose_epoch), (true, driver), "at tick {}", state.tick);
     }
     assert_ne!(driver, 13);
     assert!(probe.rejected(Rejection::Malformed) >= 1000, "{:?}", probe.health().unwrap().rejected);
@@ -373,6 +383,6 @@ fn duration_ends_both_with_zero() {
     let lines = String::from_utf8(watch.stdout).unwrap();
     let states: Vec<serde_json::Value> = lines.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
     assert!(states.len() >= 3, "{lines}");
-    assert!(states.iter().all(|state| state["mode"] == "idle" && state["q"].as_array().unwrap().len() == 16));
+    assert!(states.iter().all(|state| state["mode"] == "disarmed" && state["q"].as_array().unwrap().len() == 16));
     assert_eq!(robot.process.wait(PATIENCE).code(), Some(0), "{}", robot.process.stderr());
 }

@@ -13,6 +13,7 @@
 pub mod clock;
 mod config;
 mod error;
+pub mod keyboard;
 mod live;
 mod publisher;
 mod query;

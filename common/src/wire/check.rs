@@ -1,6 +1,7 @@
 //! The checks all messages share. Messages hold `f32`, so limits are compared as `f32`.
 
 use super::WireError;
+use crate::authority::OperatorName;
 
 /// Every value finite and in `low..=high`.
 pub(super) fn within(
@@ -40,4 +41,9 @@ pub(super) fn count(
 ) -> Result<usize, WireError> {
     let number = usize::from(value);
     if (least..=most).contains(&number) { Ok(number) } else { Err(WireError::Code { field, value, allowed }) }
+}
+
+/// Printable, and zeros after that.
+pub(super) fn name(field: &'static str, name: &OperatorName) -> Result<(), WireError> {
+    if name.is_valid() { Ok(()) } else { Err(WireError::Name { field }) }
 }

@@ -78,6 +78,12 @@ pub enum WireError {
         /// What would have been right.
         allowed: &'static str,
     },
+    /// A name that is not printable.
+    #[error("{field} is no name: printable ASCII, then zeros")]
+    Name {
+        /// Name of the field.
+        field: &'static str,
+    },
     /// The buffer given to [`encode_into`] cannot take the message.
     #[error("buffer of {found} bytes cannot take a message of {expected}")]
     Buffer {

@@ -6,7 +6,7 @@ use crate::time::{Exchange, MonoTime};
 /// First four bytes of every message.
 pub const MAGIC: [u8; 4] = *b"ALGT";
 /// Version of the protocol. Any change of any layout or meaning raises it.
-pub const PROTOCOL: u16 = 2;
+pub const PROTOCOL: u16 = 3;
 
 /// The kinds of message.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
@@ -20,6 +20,8 @@ pub enum Kind {
     Mapping = 3,
     /// [`super::HealthMessage`]
     Health = 4,
+    /// [`super::ControlMessage`]
+    Control = 5,
 }
 
 /// How every message begins; this layout is the same in all versions of the protocol.

@@ -35,6 +35,10 @@ pub struct JointStateMessage {
     pub tau: [f32; MAX_JOINTS],
     /// Commanded angles after conditioning, rad.
     pub q_command: [f32; MAX_JOINTS],
+    /// Number of the newest stop, 0 if there was none; it is in force in [`Mode::Stopped`].
+    pub stop: u32,
+    /// Epoch of the operator that has the robot, 0 if none.
+    pub holder: u64,
 }
 
 impl JointStateMessage {
@@ -93,14 +97,14 @@ impl Sealed for JointStateMessage {}
 
 impl Message for JointStateMessage {
     const KIND: Kind = Kind::JointState;
-    const LEN: usize = 498;
+    const LEN: usize = 510;
 
     fn header(&self) -> &Header {
         &self.header
     }
 
     fn check(&self) -> Result<(), WireError> {
-        check::count("mode", self.mode, 0, Mode::ALL.len() - 1, "0 to 3")?;
+        check::count("mode", self.mode, 0, Mode::ALL.len() - 1, "0 to 7")?;
         let joints = check::count("joints", self.joints, 1, MAX_JOINTS, "1 to 25")?;
         check::angle("q", &self.q[..joints])?;
         check::within("dq", &self.dq[..joints], -1e4, 1e4, "-1e4 to 1e4 rad/s")?;

@@ -1,12 +1,14 @@
 use serde::{Deserialize, Serialize};
 
 use super::codec::sealed::Sealed;
-use super::{Checked, Echo, Header, Kind, Message, WireError};
+use super::{Checked, Echo, Header, Kind, Message, WireError, check};
+use crate::authority::{Clutch, Intent, OperatorName};
 use crate::mapping::Tuning;
 use crate::master::{MasterGeometry, MasterPose};
 use crate::time::MonoTime;
 
-/// A pose of the master hand, with the hand's geometry and tuning: a robot needs no other message to follow it.
+/// A pose of the master hand, with the hand's geometry and tuning and what its owner wants: a robot needs no other
+/// message to follow it.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct PoseMessage {
     /// Header.
@@ -23,7 +25,16 @@ pub struct PoseMessage {
     pub phalanges: [[f32; 3]; 5],
     /// What the mapping should know about the operator, all zero if nothing is known.
     pub tuning: TuningMessage,
+    /// [`Clutch`]
+    pub clutch: u32,
+    /// Bit 0: take over; bit 1: leave.
+    pub request: u8,
+    /// The operator's name.
+    pub operator: OperatorName,
 }
+
+const TAKEOVER: u8 = 1;
+const LEAVING: u8 = 2;
 
 /// [`Tuning`] on the wire.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -64,7 +75,7 @@ impl TuningMessage {
 impl PoseMessage {
     /// The message of a pose.
     #[must_use]
-    pub fn new(header: Header, echo: Echo, captured: MonoTime, pose: &MasterPose) -> Self {
+    pub fn new(header: Header, echo: Echo, captured: MonoTime, pose: &MasterPose, intent: Intent) -> Self {
         let single = |rows: [[f64; 3]; 5]| rows.map(|row| row.map(|value| value as f32));
         Self {
             header,
@@ -74,6 +85,20 @@ impl PoseMessage {
             bases: single(pose.geometry.bases),
             phalanges: single(pose.geometry.phalanges),
             tuning: pose.tuning.map_or_else(TuningMessage::default, Into::into),
+            clutch: intent.clutch.0,
+            request: u8::from(intent.takeover) * TAKEOVER | u8::from(intent.leaving) * LEAVING,
+            operator: intent.operator,
+        }
+    }
+
+    /// What the operator wants.
+    #[must_use]
+    pub const fn intent(&self) -> Intent {
+        Intent {
+            clutch: Clutch(self.clutch),
+            takeover: self.request & TAKEOVER != 0,
+            leaving: self.request & LEAVING != 0,
+            operator: self.operator,
         }
     }
 
@@ -99,13 +124,15 @@ impl Sealed for PoseMessage {}
 
 impl Message for PoseMessage {
     const KIND: Kind = Kind::Pose;
-    const LEN: usize = 312;
+    const LEN: usize = 333;
 
     fn header(&self) -> &Header {
         &self.header
     }
 
     fn check(&self) -> Result<(), WireError> {
+        check::count("request", self.request, 0, 3, "0 to 3")?;
+        check::name("operator", &self.operator)?;
         Ok(self.to_pose().validate()?)
     }
 }

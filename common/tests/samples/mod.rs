@@ -3,13 +3,15 @@
 #![allow(dead_code, unreachable_pub, reason = "each test takes what it needs")]
 
 use nalgebra::Vector3;
+use teleop_common::authority::{Clutch, Intent, OperatorName};
 use teleop_common::hand::{Finger, JointVector};
 use teleop_common::ik::{IkReport, IkStatus};
 use teleop_common::mapping::{FingerSignals, MappingOutput, Tuning};
 use teleop_common::master::{MasterGeometry, MasterPose};
 use teleop_common::time::MonoTime;
 use teleop_common::wire::{
-    Echo, Header, HealthMessage, JointStateMessage, MappingMessage, PoseMessage, Quantiles, pack_joints,
+    ControlMessage, Echo, Header, HealthMessage, JointStateMessage, MappingMessage, PoseMessage, Quantiles, Request,
+    pack_joints,
 };
 
 pub const EPOCH: u64 = 0x0123_4567_89ab_cdef;
@@ -33,9 +35,21 @@ pub fn master_pose() -> MasterPose {
     }
 }
 
+pub fn intent() -> Intent {
+    Intent { clutch: Clutch(7), takeover: true, leaving: false, operator: OperatorName::new("ada@lab").unwrap() }
+}
+
+pub fn control() -> ControlMessage {
+    ControlMessage::new(
+        Header::new::<ControlMessage>(EPOCH, 46, MonoTime(7_000_000_047)),
+        PEER,
+        Request::Reset { stop: 5 },
+    )
+}
+
 pub fn pose() -> PoseMessage {
     let header = Header::new::<PoseMessage>(EPOCH, 42, MonoTime(3_000_000_019));
-    PoseMessage::new(header, echo(), MonoTime(2_999_000_000), &master_pose())
+    PoseMessage::new(header, echo(), MonoTime(2_999_000_000), &master_pose(), intent())
 }
 
 pub fn joint_state() -> JointStateMessage {
@@ -54,6 +68,8 @@ pub fn joint_state() -> JointStateMessage {
         dq: ramp(-0.5),
         tau: ramp(0.25),
         q_command: ramp(0.5),
+        stop: 3,
+        holder: PEER,
     }
 }
 
@@ -93,12 +109,15 @@ pub fn health() -> HealthMessage {
         fault: 7,
         ticks: 1_000_001,
         overruns: 17,
-        tick_us: Quantiles { p50: 21.5, p99: 40.25, max: 97.75 },
+        tick_us: Quantiles { p50: 21.5, p95: 33.5, p99: 40.25, max: 97.75 },
         poses_accepted: 9_001,
-        rejected: [1, 2, 3, 4, 5, 6, 7, 8],
+        rejected: [1, 2, 3, 4, 5, 6, 7, 8, 9],
         holds: 3,
-        age_ms: Quantiles { p50: 20.5, p99: 26.25, max: 31.75 },
+        age_ms: Quantiles { p50: 20.5, p95: 24.5, p99: 26.25, max: 31.75 },
         telemetry_dropped: 11,
         rate_hz: 333.25,
+        operator: OperatorName::new("ada@lab").unwrap(),
+        stages: [0.5, 1.5, 2.5, 3.5].map(|p50| Quantiles { p50, p95: p50 + 4.0, p99: p50 + 8.0, max: p50 + 16.0 }),
+        total_ms: Quantiles { p50: 8.0, p95: 16.0, p99: 24.0, max: 32.0 },
     }
 }

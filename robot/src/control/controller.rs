@@ -1,28 +1,68 @@
 use std::time::Duration;
 
+use serde::{Deserialize, Serialize};
+use teleop_common::authority::{Heard, Intent, Latch, Machine, MachineParams};
 use teleop_common::guard::TipGuard;
 use teleop_common::hand::{HandModel, JointVector, MAX_FINGERS};
 use teleop_common::mapping::{MappingOutput, MappingParams, ParamError, Retargeter};
 use teleop_common::master::MasterPose;
 use teleop_common::mode::Mode;
+use teleop_common::playout::{Played, Playout, PlayoutParams};
 use teleop_common::time::MonoTime;
 
 use super::Conditioner;
 use crate::driver::{JointCommand, JointState};
+
+/// What the hand does when a hold lasts.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Relax {
+    /// Holds on.
+    #[default]
+    Hold,
+    /// Holds its posture with less torque, so that a person can open it.
+    Yield,
+    /// Opens: goes to its home posture with the speed of engaging.
+    Open,
+    /// Lets go: no torque.
+    Off,
+}
+
+/// What a stop does.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum StopAction {
+    /// Brakes and holds the posture (stop category 2 of IEC 60204-1).
+    #[default]
+    Hold,
+    /// Brakes, then takes the torque off (category 1).
+    Off,
+}
+
+/// Share of the torque limits that is left to a hand that yields.
+const YIELD: f64 = 0.2;
 
 /// How the control loop behaves in time.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ControlParams {
     /// Ticks per second.
     pub rate: f64,
-    /// Without a fresh pose for this long the hand holds still.
+    /// So long after a pose was due the hand holds still.
     pub hold_after: Duration,
+    /// What it does when that lasts, and after how long.
+    pub relax: Relax,
+    /// See [`ControlParams::relax`].
+    pub relax_after: Duration,
+    /// What a stop does.
+    pub stop: StopAction,
     /// Time constant of each of the two low-pass stages of the command, s; 0 is off.
     pub smoothing: f64,
     /// Speed limit right after the hand starts to follow, rad/s.
     pub engage_speed: f64,
     /// Time over which that limit widens to the joints' own, s.
     pub engage_ramp: f64,
+    /// How unevenly arriving poses are played.
+    pub playout: PlayoutParams,
     /// How deep two fingertips may be commanded into each other, m. More squeezes harder what is between them.
     pub tip_overlap: f64,
 }
@@ -31,20 +71,26 @@ impl Default for ControlParams {
     fn default() -> Self {
         Self {
             rate: 333.0,
-            hold_after: Duration::from_millis(200),
+            hold_after: Duration::from_millis(100),
+            relax: Relax::Hold,
+            relax_after: Duration::from_secs(10),
+            stop: StopAction::Hold,
             smoothing: 0.008,
             engage_speed: 1.0,
             engage_ramp: 1.0,
+            playout: PlayoutParams::default(),
             tip_overlap: 0.0005,
         }
     }
 }
 
-/// A pose that passed the gate.
+/// A pose that passed the lease.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct PoseSample {
     /// The pose.
     pub pose: MasterPose,
+    /// What the operator wants.
+    pub intent: Intent,
     /// Epoch of the operator that sent it.
     pub epoch: u64,
     /// Its number within the epoch.
@@ -53,8 +99,22 @@ pub struct PoseSample {
     pub captured_remote: MonoTime,
     /// The same by this process's clock.
     pub captured: MonoTime,
+    /// When it was sent, by this process's clock.
+    pub sent: MonoTime,
     /// When it arrived.
     pub received: MonoTime,
+}
+
+impl PoseSample {
+    fn heard(&self) -> Heard {
+        Heard {
+            epoch: self.epoch,
+            sequence: self.sequence,
+            captured: self.captured_remote,
+            received: self.received,
+            clutch: self.intent.clutch,
+        }
+    }
 }
 
 /// Why the hand was stopped for good.
@@ -87,12 +147,18 @@ pub struct TickRecord {
     pub state: JointState,
     /// What was commanded.
     pub command: JointCommand,
-    /// The newest pose obeyed so far.
+    /// The newest pose admitted so far.
     pub sample: Option<PoseSample>,
-    /// What the mapping made of it.
+    /// When the hand was in the pose that the hand follows now, own clock.
+    pub played: Option<MonoTime>,
+    /// Delay of the playout behind the capture; zero: the newest pose is played.
+    pub playout: Duration,
+    /// What the mapping made of the pose played.
     pub mapping: Option<MappingOutput>,
     /// Times the hand had to hold so far.
     pub holds: u64,
+    /// The stop latch that the tick saw.
+    pub latch: Latch,
 }
 
 /// The control loop's state; [`Controller::tick`] is its body.
@@ -102,10 +168,11 @@ pub struct Controller {
     retargeter: Retargeter,
     guard: TipGuard,
     conditioner: Option<Conditioner>,
-    mode: Mode,
+    machine: Machine,
+    playout: Playout,
     fault: Fault,
-    engaged_at: MonoTime,
     sample: Option<PoseSample>,
+    played: Option<Played>,
     mapping: Option<MappingOutput>,
     // Its posture with the fingertips apart, and the fingers that may give way for that.
     target: JointVector,
@@ -113,7 +180,7 @@ pub struct Controller {
     // The last valid state of the hand.
     state: JointState,
     tick: u64,
-    holds: u64,
+    now: MonoTime,
 }
 
 impl Controller {
@@ -129,16 +196,21 @@ impl Controller {
             guard: TipGuard::new(&hand, params.tip_overlap),
             retargeter: Retargeter::new(hand, mapping)?,
             conditioner: None,
-            mode: Mode::Idle,
+            machine: Machine::new(MachineParams {
+                hold_after: params.hold_after,
+                relax_after: (params.relax != Relax::Hold).then_some(params.relax_after),
+                engage_ramp: Duration::from_secs_f64(params.engage_ramp.max(0.0)),
+            }),
+            playout: Playout::new(params.playout),
             fault: Fault::None,
-            engaged_at: MonoTime(0),
             sample: None,
+            played: None,
             mapping: None,
             target: state.q,
             movable: [false; MAX_FINGERS],
             state,
             tick: 0,
-            holds: 0,
+            now: MonoTime(0),
         })
     }
 
@@ -151,24 +223,35 @@ impl Controller {
     /// The last tick's mode.
     #[must_use]
     pub fn mode(&self) -> Mode {
-        self.mode
+        self.machine.mode()
     }
 
     /// Stops the hand for good: from now on commands are zero torque.
     pub fn fail(&mut self, fault: Fault) {
-        self.mode = Mode::Faulted;
+        self.machine.fail(self.now);
         if self.fault == Fault::None {
             self.fault = fault;
         }
     }
 
-    /// One tick: from the newest admitted pose and the hand's state to the command.
+    /// Takes a pose that passed the lease, to be used from the next tick on. One that is not newer is left out.
+    pub fn admit(&mut self, sample: &PoseSample) {
+        match &self.sample {
+            Some(last) if last.epoch == sample.epoch && last.sequence >= sample.sequence => return,
+            Some(last) if last.epoch == sample.epoch => {}
+            _ => self.playout.reset(),
+        }
+        self.playout.push(sample.captured, sample.received, &sample.pose);
+        self.sample = Some(*sample);
+    }
+
+    /// One tick: from the poses admitted, the stop latch and the hand's state to the command.
     ///
-    /// `newest` may be the same pose as before; it counts as fresh for [`ControlParams::hold_after`] from its
-    /// arrival. Without a fresh pose the hand brakes within its limits and then holds its posture; when poses come
-    /// again it starts from there, slowly at first.
-    pub fn tick(&mut self, now: MonoTime, newest: Option<&PoseSample>, state: &JointState) -> TickRecord {
+    /// What the mode becomes, and when, is the table of [`teleop_common::authority`]; in a mode that does not follow, the hand brakes within its limits and holds its
+    /// posture, and when it follows again it starts from there, slowly at first.
+    pub fn tick(&mut self, now: MonoTime, latch: Latch, state: &JointState) -> TickRecord {
         self.tick += 1;
+        self.now = now;
         let joints = self.hand().joints.len();
         let valid = |values: &JointVector| values.len() == joints && values.is_finite();
         if valid(&state.q) && valid(&state.dq) && valid(&state.tau) {
@@ -178,7 +261,7 @@ impl Controller {
             self.fail(Fault::StateInvalid);
         }
         let state = self.state;
-        let command = if self.mode == Mode::Faulted { None } else { self.command(now, newest, &state) };
+        let command = if self.mode() == Mode::Faulted { None } else { self.command(now, latch, &state) };
         let command = command.unwrap_or_else(|| {
             self.fail(Fault::CommandNotFinite);
             JointCommand::limp(&state)
@@ -186,66 +269,84 @@ impl Controller {
         TickRecord {
             tick: self.tick,
             now,
-            mode: self.mode,
+            mode: self.mode(),
             fault: self.fault,
             state,
             command,
             sample: self.sample,
+            played: self.played.map(|played| played.captured),
+            playout: self.playout.delay(),
             mapping: self.mapping,
-            holds: self.holds,
+            holds: self.machine.holds(),
+            latch,
         }
     }
 
     /// The next command, or `None` if it would not be finite.
-    fn command(&mut self, now: MonoTime, newest: Option<&PoseSample>, state: &JointState) -> Option<JointCommand> {
-        let (params, retargeter) = (self.params, &mut self.retargeter);
+    fn command(&mut self, now: MonoTime, latch: Latch, state: &JointState) -> Option<JointCommand> {
+        let params = self.params;
+        let mode = self.machine.step(now, self.sample.as_ref().map(PoseSample::heard).as_ref(), latch);
+        if self.sample.is_some_and(|sample| now.since(sample.received) <= self.machine.patience()) {
+            self.map(now);
+        }
+        let (retargeter, lasted) = (&self.retargeter, self.machine.lasted(now).as_secs_f64());
+        let hand = retargeter.hand();
         let conditioner = self
             .conditioner
-            .get_or_insert_with(|| Conditioner::new(retargeter.hand(), &state.q, 1.0 / params.rate, params.smoothing));
-        let fresh = newest.filter(|sample| now.since(sample.received) <= params.hold_after);
-        if let Some(sample) = fresh {
-            let known = self.sample.as_ref().map(|last| (last.epoch, last.sequence));
-            if known != Some((sample.epoch, sample.sequence)) {
-                let mapping = retargeter.map(&sample.pose);
-                // A finger that only copies the human's shape keeps it: the others go round it.
-                self.movable = [false; MAX_FINGERS];
-                self.movable.iter_mut().zip(mapping.fingers()).for_each(|(own, signals)| *own = signals.k > 0.0);
-                self.target = self.guard.apart(retargeter.hand(), &mapping.q, &self.movable);
-                self.mapping = Some(mapping);
-                self.sample = Some(*sample);
+            .get_or_insert_with(|| Conditioner::new(hand, &state.q, 1.0 / params.rate, params.smoothing));
+        let (mut torque, mut limp) = (1.0, false);
+        let mut follow = |conditioner: &mut Conditioner, target: &JointVector, speed: f64| {
+            let (guard, movable) = (&self.guard, &self.movable);
+            conditioner.follow(target, speed, |q, velocity, range| {
+                guard.slow(hand, q, movable, velocity, range, 1.0 / params.rate);
+            });
+        };
+        match mode {
+            // The limit widens tenfold over the ramp, then only the joints' own limits count.
+            Mode::Engaging => {
+                let widened = params.engage_speed * (1.0 + 9.0 * lasted / params.engage_ramp);
+                follow(conditioner, &self.target, widened);
             }
-            if self.mode != Mode::Engaged {
-                self.mode = Mode::Engaged;
-                self.engaged_at = now;
+            Mode::Engaged => follow(conditioner, &self.target, f64::INFINITY),
+            Mode::Relaxed if params.relax == Relax::Open => follow(conditioner, &hand.home(), params.engage_speed),
+            _ => {
+                conditioner.hold();
+                torque = if mode == Mode::Relaxed && params.relax == Relax::Yield { YIELD } else { 1.0 };
+                limp = mode == Mode::Relaxed && params.relax == Relax::Off
+                    || mode == Mode::Stopped && params.stop == StopAction::Off && conditioner.at_rest();
             }
-        } else if self.mode == Mode::Engaged {
-            self.mode = Mode::Holding;
-            self.holds += 1;
         }
-        match self.mode {
-            Mode::Engaged => {
-                let since = now.since(self.engaged_at).as_secs_f64();
-                // The limit widens tenfold over the ramp, then only the joints' own limits count.
-                let ramp = since < params.engage_ramp;
-                let widened = params.engage_speed * (1.0 + 9.0 * since / params.engage_ramp);
-                let (guard, hand, movable) = (&self.guard, retargeter.hand(), &self.movable);
-                conditioner.follow(&self.target, if ramp { widened } else { f64::INFINITY }, |q, velocity, range| {
-                    guard.slow(hand, q, movable, velocity, range, 1.0 / params.rate);
-                });
-            }
-            _ => conditioner.hold(),
+        if limp {
+            // It may be moved by hand now, and whatever follows starts from where it is.
+            *conditioner = Conditioner::new(hand, &state.q, 1.0 / params.rate, params.smoothing);
+            return Some(JointCommand::limp(state));
         }
-        let command = servo(retargeter.hand(), state, conditioner.position(), conditioner.velocity());
+        let command = servo(hand, state, conditioner.position(), conditioner.velocity(), torque);
         (command.q.is_finite() && command.dq.is_finite() && command.tau.is_finite()).then_some(command)
+    }
+
+    /// Maps the pose that is due, if it is another than the last one mapped.
+    fn map(&mut self, now: MonoTime) {
+        let Some(played) = self.playout.play(now) else { return };
+        if self.played == Some(played) {
+            return;
+        }
+        let mapping = self.retargeter.map(&played.pose);
+        // A finger that only copies the human's shape keeps it: the others go round it.
+        self.movable = [false; MAX_FINGERS];
+        self.movable.iter_mut().zip(mapping.fingers()).for_each(|(own, signals)| *own = signals.k > 0.0);
+        self.target = self.guard.apart(self.retargeter.hand(), &mapping.q, &self.movable);
+        self.mapping = Some(mapping);
+        self.played = Some(played);
     }
 }
 
-/// Torques of the position controller (PD with velocity feed-forward), limited per joint.
-fn servo(hand: &HandModel, state: &JointState, q: &JointVector, dq: &JointVector) -> JointCommand {
+/// Torques of the position controller (PD with velocity feed-forward), limited to a `share` of each joint's limit.
+fn servo(hand: &HandModel, state: &JointState, q: &JointVector, dq: &JointVector, share: f64) -> JointCommand {
     let mut tau = JointVector::zeros(q.len());
     for (slot, joint) in hand.joints.iter().enumerate() {
         let torque = joint.kp * (q[slot] - state.q[slot]) + joint.kd * (dq[slot] - state.dq[slot]);
-        tau[slot] = torque.clamp(-joint.torque, joint.torque);
+        tau[slot] = torque.clamp(-share * joint.torque, share * joint.torque);
     }
     JointCommand { q: *q, dq: *dq, tau }
 }

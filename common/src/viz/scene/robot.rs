@@ -16,7 +16,16 @@ use crate::viz::{TIMELINE, palette};
 type Places = Vec<(usize, Isometry3<f64>)>;
 
 /// The modes in the order of their legend, which may be cut short.
-const BANDS: [Mode; 4] = [Mode::Engaged, Mode::Holding, Mode::Faulted, Mode::Idle];
+const BANDS: [Mode; 8] = [
+    Mode::Engaged,
+    Mode::Engaging,
+    Mode::Armed,
+    Mode::Holding,
+    Mode::Relaxed,
+    Mode::Stopped,
+    Mode::Faulted,
+    Mode::Disarmed,
+];
 
 /// The robot's hand and plots.
 pub(super) struct Drawing<'a> {
@@ -283,9 +292,13 @@ fn modes(stream: &RecordingStream) -> RecordingStreamResult<()> {
 
 const fn mode_color(mode: Mode) -> Color {
     match mode {
-        Mode::Idle => palette::FAINT,
+        Mode::Disarmed => palette::FAINT,
+        Mode::Armed => palette::rgb(120, 160, 220),
+        Mode::Engaging => palette::rgb(140, 210, 120),
         Mode::Engaged => palette::rgb(40, 200, 140),
         Mode::Holding => palette::rgb(240, 170, 40),
+        Mode::Relaxed => palette::rgb(200, 140, 80),
+        Mode::Stopped => palette::rgb(230, 90, 150),
         Mode::Faulted => palette::rgb(235, 64, 52),
     }
 }

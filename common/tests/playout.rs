@@ -1,0 +1,136 @@
+//! The playout buffer in virtual time: delay where it is needed, evenness, no jumps.
+#![allow(clippy::unwrap_used, reason = "helpers of tests")]
+
+use std::time::Duration;
+
+use teleop_common::master::{MasterGeometry, MasterPose};
+use teleop_common::playout::{Playout, PlayoutMode, PlayoutParams};
+use teleop_common::time::MonoTime;
+
+const MS: u64 = 1_000_000;
+/// Control period, ns.
+const TICK: u64 = 3 * MS;
+
+fn pose(value: f64) -> MasterPose {
+    MasterPose { q: [value; 20], geometry: MasterGeometry::PARADIGMATIC, tuning: None }
+}
+
+/// The master's motion: rad at a time in s.
+fn motion(t: f64) -> f64 {
+    0.7 * (2.0 * t).sin() + 0.1 * (9.0 * t).sin()
+}
+
+/// A small generator of numbers in 0..1.
+struct Dice(u64);
+
+impl Dice {
+    fn roll(&mut self) -> f64 {
+        self.0 = self.0.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        (self.0 >> 11) as f64 / (1_u64 << 53) as f64
+    }
+}
+
+struct Run {
+    /// Largest error against the motion delayed by what `captured` says, rad.
+    error: f64,
+    /// Mean |second difference| from tick to tick, rad.
+    rough: f64,
+    delay: Duration,
+}
+
+/// 20 s of the motion, sent every `period` ms, over a link of `delay` +- `jitter` ms with `loss`; newest wins.
+fn run(params: PlayoutParams, period: u64, delay: f64, jitter: f64, loss: f64) -> Run {
+    let mut dice = Dice(1);
+    let mut arrivals: Vec<(u64, u64)> = (0..20_000 / period)
+        .map(|n| n * period * MS + MS * 1000)
+        .filter_map(|captured| {
+            let transit = ((delay + jitter * (2.0 * dice.roll() - 1.0)) * 1e6) as u64;
+            (dice.roll() >= loss).then_some((captured + transit, captured))
+        })
+        .collect();
+    arrivals.sort_unstable();
+    let mut playout = Playout::new(params);
+    let (mut next, mut newest) = (0, 0);
+    let mut last: [Option<f64>; 2] = [None; 2];
+    let (mut error, mut rough, mut ticks) = (0.0_f64, 0.0, 0.0);
+    let (mut played_before, mut delay_before) = (MonoTime(0), playout.delay());
+    for now in (1000 * MS..21_000 * MS).step_by(TICK as usize) {
+        while let Some(&(received, captured)) = arrivals.get(next).filter(|(received, _)| *received <= now) {
+            next += 1;
+            // What was overtaken does not pass the lease.
+            if captured > newest {
+                newest = captured;
+                playout.push(MonoTime(captured), MonoTime(received), &pose(motion(captured as f64 * 1e-9)));
+            }
+        }
+        let Some(played) = playout.play(MonoTime(now)) else { continue };
+        assert!(played.captured >= played_before, "time runs backwards");
+        let change = playout.delay().abs_diff(delay_before).as_secs_f64();
+        assert!(change <= 0.1 * TICK as f64 * 1e-9 + 1e-9, "the delay jumped by {change} s");
+        (played_before, delay_before) = (played.captured, playout.delay());
+        let value = played.pose.q[0];
+        // After it has found its delay.
+        if now > 6000 * MS {
+            error = error.max((value - motion(played.captured.0 as f64 * 1e-9)).abs());
+            if let [Some(a), Some(b)] = last {
+                rough += (value - 2.0 * b + a).abs();
+                ticks += 1.0;
+            }
+        }
+        last = [last[1], Some(value)];
+    }
+    Run { error, rough: rough / ticks, delay: playout.delay() }
+}
+
+#[test]
+fn a_good_link_gets_no_delay() {
+    for (delay, jitter) in [(0.3, 0.2), (3.0, 1.0), (40.0, 1.0)] {
+        for period in [8, 10, 33] {
+            let run = run(PlayoutParams::default(), period, delay, jitter, 0.001);
+            assert_eq!(run.delay, Duration::ZERO, "{delay} +- {jitter} ms, every {period} ms");
+        }
+    }
+}
+
+#[test]
+fn a_bad_link_gets_as_much_as_it_needs_and_is_played_evenly() {
+    let direct = PlayoutParams { mode: PlayoutMode::Direct, ..PlayoutParams::default() };
+    for (delay, jitter, loss, most) in [(50.0, 20.0, 0.0, 95), (50.0, 20.0, 0.3, 130), (30.0, 0.0, 0.3, 80)] {
+        let buffered = run(PlayoutParams::default(), 10, delay, jitter, loss);
+        let newest = run(direct, 10, delay, jitter, loss);
+        println!(
+            "{delay} +- {jitter} ms, loss {loss}: delay {:?}, roughness {:.3} instead of {:.3} mrad, error {:.1} mrad",
+            buffered.delay,
+            buffered.rough * 1e3,
+            newest.rough * 1e3,
+            buffered.error * 1e3
+        );
+        let least = Duration::from_secs_f64((delay + 10.0) * 1e-3);
+        assert!(buffered.delay >= least && buffered.delay <= Duration::from_millis(most), "{:?}", buffered.delay);
+        assert!(buffered.rough < 0.35 * newest.rough, "{} against {}", buffered.rough, newest.rough);
+        // At most 2.3 rad/s over the few ms of a gap that the delay does not cover.
+        assert!(buffered.error < 0.1, "{} rad", buffered.error);
+    }
+}
+
+#[test]
+fn the_delay_is_bounded_and_can_be_fixed_or_off() {
+    let params = PlayoutParams { max_delay: Duration::from_millis(60), ..PlayoutParams::default() };
+    assert_eq!(run(params, 10, 80.0, 40.0, 0.2).delay, params.max_delay);
+    let fixed = PlayoutParams { mode: PlayoutMode::Fixed, ..params };
+    assert_eq!(run(fixed, 10, 1.0, 0.0, 0.0).delay, params.max_delay);
+    let direct = PlayoutParams { mode: PlayoutMode::Direct, ..params };
+    assert_eq!(run(direct, 10, 80.0, 40.0, 0.2).delay, Duration::ZERO);
+}
+
+#[test]
+fn a_reset_forgets_the_other_operator() {
+    let mut playout = Playout::new(PlayoutParams::default());
+    assert_eq!(playout.play(MonoTime(5)), None);
+    playout.push(MonoTime(1000), MonoTime(2000), &pose(1.0));
+    assert_eq!(playout.play(MonoTime(3000)).unwrap().pose, pose(1.0));
+    playout.reset();
+    assert_eq!(playout.play(MonoTime(4000)), None);
+    playout.push(MonoTime(10), MonoTime(4500), &pose(2.0));
+    assert_eq!(playout.play(MonoTime(5000)).unwrap().pose, pose(2.0), "an earlier capture of another clock");
+}
