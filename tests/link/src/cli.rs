@@ -3,22 +3,23 @@
 use std::str::FromStr;
 use std::time::Duration;
 
-use clap::{Args, Parser, Subcommand, ValueEnum};
+use clap::{Args, Parser, Subcommand};
 
 use crate::{Blackouts, Endpoint, Impairment, Invalid, Link, Profile, Shape};
 
 const EXAMPLES: &str = "\
 Examples:
-  teleop-link --wan fair udp/127.0.0.1:7457 udp/127.0.0.1:7447   between an operator and a robot on this machine:
-                                                                 operator --connect udp/127.0.0.1:7457
+  teleop-link --wan fair udp/127.0.0.1:7457 udp/127.0.0.1:7447
+          then `operator --connect udp/127.0.0.1:7457`, to the robot on this machine
   teleop-link --wan poor --seed 7 tcp/0.0.0.0:7447 tcp/robot:7447
   teleop-link --delay-ms 50 --jitter-ms 20 --loss 30% quic/0.0.0.0:7447 quic/robot:7447
-  teleop-link --wan good --rate-mbit 1/8 --blackout \"every 20 for 1\" udp/0.0.0.0:7447 udp/robot:7447
-  teleop-link profiles                                           what --wan knows
+  teleop-link --wan good --rate-mbit 1/8 --blackout \"every 20 for 1\" udp/[::]:7447 udp/robot:7447
+  teleop-link profiles
 
-A figure is for both directions, or UP/DOWN: to the target, and back. The same seed gives the same chances to the same
-packets. Over tcp and tls a lost packet comes late (a round trip and 200 ms) with all those behind it, a blackout holds
-everything up; over udp and quic both are losses.
+A figure is for both directions, or UP/DOWN: to the target, and back. The same seed gives the same
+chances to the same packets. Over udp and quic, losses and blackouts are losses; over tcp and tls
+a lost packet comes late, by a round trip and 200 ms, with all those behind it, and a blackout holds
+everything up.
 
 Exit codes: 0 done (also after Ctrl-C), 1 failed while running, 2 wrong usage.";
 
@@ -60,9 +61,6 @@ pub struct RunArgs {
     /// Where chance comes from
     #[arg(long, default_value_t = 1, value_name = "NUMBER")]
     pub seed: u64,
-    /// Single figures of the link.
-    #[command(flatten)]
-    pub figures: Figures,
     /// Print what was done every so many seconds; 0 for at the end only
     #[arg(long, default_value_t = 5.0, value_name = "SECONDS", value_parser = seconds)]
     pub stats: f64,
@@ -72,6 +70,9 @@ pub struct RunArgs {
     /// End after this many seconds
     #[arg(long, value_name = "SECONDS", value_parser = seconds)]
     pub duration: Option<f64>,
+    /// Single figures of the link.
+    #[command(flatten)]
+    pub figures: Figures,
 }
 
 /// Figures that replace those of the profile.
@@ -84,9 +85,9 @@ pub struct Figures {
     /// How much the delay varies
     #[arg(long, value_name = "MS")]
     pub jitter_ms: Option<Both<Number>>,
-    /// How it varies: evenly within +- jitter, normally with this deviation, or with a heavy tail of this mean
+    /// How it varies: uniform (within +- jitter), normal (with this deviation) or pareto (a heavy tail of this mean)
     #[arg(long, value_name = "SHAPE")]
-    pub jitter_shape: Option<JitterShape>,
+    pub jitter_shape: Option<Shape>,
     /// How much the jitter of a packet resembles that of the one before
     #[arg(long, value_name = "0..1")]
     pub jitter_correlation: Option<Both<Number>>,
@@ -133,17 +134,6 @@ pub struct Number(pub f64);
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Share(pub f64);
 
-/// How jitter is distributed.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
-pub enum JitterShape {
-    /// Evenly
-    Uniform,
-    /// The bell curve
-    Normal,
-    /// A heavy tail
-    Pareto,
-}
-
 impl Figures {
     /// The link of a profile with these figures instead of its own.
     ///
@@ -170,13 +160,7 @@ impl Figures {
         set(&self.rate_mbit, &|way, value| way.rate = (value != 0.0).then_some(value * 1e6));
         set(&self.queue_kb, &|way, value| way.queue = (value * 1e3) as usize);
         if let Some(shape) = self.jitter_shape {
-            for way in [&mut link.up, &mut link.down] {
-                way.shape = match shape {
-                    JitterShape::Uniform => Shape::Uniform,
-                    JitterShape::Normal => Shape::Normal,
-                    JitterShape::Pareto => Shape::Pareto,
-                };
-            }
+            (link.up.shape, link.down.shape) = (shape, shape);
         }
         if let Some(blackouts) = &self.blackout {
             link.blackouts = blackouts.clone();
@@ -270,6 +254,7 @@ mod tests {
             ("--rate-mbit 1e9", "must be 0.001 to 100000 Mbit/s"),
             ("--queue-kb 1", "must be 1500 bytes to 1 GiB"),
             ("--jitter-correlation 1", "below 1"),
+            ("--jitter-shape flat", "\"flat\" is none of uniform, normal, pareto"),
             ("--blackout 3..2", "must end after it begins"),
             ("--duration never", "not a number"),
             ("more", "more"),

@@ -1,6 +1,7 @@
 //! What one direction of a link does to packets.
 
 use std::fmt;
+use std::str::FromStr;
 use std::time::Duration;
 
 use serde_json::{Value, json};
@@ -163,6 +164,19 @@ fn ms(time: Duration) -> f64 {
     time.as_secs_f64() * 1e3
 }
 
+impl FromStr for Shape {
+    type Err = Invalid;
+
+    fn from_str(name: &str) -> Result<Self, Invalid> {
+        match name {
+            "uniform" => Ok(Self::Uniform),
+            "normal" => Ok(Self::Normal),
+            "pareto" => Ok(Self::Pareto),
+            _ => Err(Invalid(format!("{name:?} is none of uniform, normal, pareto"))),
+        }
+    }
+}
+
 impl fmt::Display for Shape {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
@@ -195,7 +209,7 @@ impl fmt::Display for Impairment {
             write!(f, ", {} % twice", percent(self.duplicate))?;
         }
         if let Some(rate) = self.rate {
-            write!(f, ", {} Mbit/s with a queue of {} kB", rate / 1e6, (self.queue + 500) / 1000)?;
+            write!(f, ", {} Mbit/s", rate / 1e6)?;
         }
         Ok(())
     }

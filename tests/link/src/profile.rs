@@ -62,10 +62,14 @@ impl From<Impairment> for Link {
 /// In words.
 impl fmt::Display for Link {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        if self.up == self.down {
-            write!(f, "each way {}", self.up)?;
-        } else {
-            write!(f, "up {}; down {}", self.up, self.down)?;
+        let (up, down) = (&self.up, &self.down);
+        match (up.rate, down.rate) {
+            _ if up == down => write!(f, "each way {up}")?,
+            (Some(rate_up), Some(rate_down)) if *up == (Impairment { rate: up.rate, ..*down }) => {
+                let rest = Impairment { rate: None, ..*up };
+                write!(f, "each way {rest}, {} Mbit/s up, {} down", rate_up / 1e6, rate_down / 1e6)?;
+            }
+            _ => write!(f, "up {up}; down {down}")?,
         }
         if !self.blackouts.is_empty() {
             write!(f, "; dark {} s", self.blackouts)?;
