@@ -4,10 +4,24 @@
 //! same again for the same seed. A [`Relay`] stands between two processes, UDP or TCP, and treats their traffic as two
 //! such models say.
 //!
+//! ```
+//! use std::time::Duration;
+//! use teleop_link::{Fate, Profile};
+//!
+//! let poor: Profile = "poor".parse()?;
+//! let [mut up, _down] = poor.link().models(1);
+//! match up.send(Duration::from_millis(10), 200) {
+//!     Fate::Arrives { at, .. } => assert!(at >= Duration::from_millis(70)),
+//!     Fate::Lost(cause) => println!("{cause:?}"),
+//! }
+//! # Ok::<(), teleop_link::Invalid>(())
+//! ```
+//!
 //! | module | one line |
 //! |---|---|
 //! | [`impairment`] | what one direction of a link does to packets, as figures |
 //! | [`blackout`] | when nothing passes |
+//! | [`dice`] | seeded chance |
 //! | [`model`] | the model: what happens to each packet |
 //! | [`profile`] | named links: both directions, with typical figures |
 //! | [`endpoint`] | `udp/host:port` and its address |

@@ -113,7 +113,7 @@ fn report(relay: &Relay, start: Instant, json: bool) {
     }
     let Stats { up, down, clients, refused, blackout_s } = stats;
     let mut line =
-        format!("{:.0} s, {clients} clients; up {}; down {}", start.elapsed().as_secs_f64(), list(&up), list(&down));
+        format!("{:.0} s, clients {clients}; up {}; down {}", start.elapsed().as_secs_f64(), list(&up), list(&down));
     if blackout_s > 0.0 {
         line += &format!("; dark for {blackout_s:.1} s");
     }
