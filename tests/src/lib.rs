@@ -5,14 +5,14 @@
 //! | [`process`] | the real binaries as child processes |
 //! | [`probe`] | what a robot publishes, with arrival times |
 //! | [`judge`] | whether a robot's commands kept their limits |
-//! | [`relay`] | a bad network between two processes |
+//!
+//! The bad network between two processes is the package `teleop-link`.
 
 use std::time::{Duration, Instant};
 
 pub mod judge;
 pub mod probe;
 pub mod process;
-pub mod relay;
 
 /// How long something that must come may take on a loaded machine.
 pub const PATIENCE: Duration = Duration::from_secs(30);

@@ -16,12 +16,12 @@ use teleop_common::mode::Mode;
 use teleop_common::net::Arrival;
 use teleop_common::time::MonoTime;
 use teleop_common::wire::{Echo, MAX_MESSAGE, PoseMessage, Stamper, encode_into};
+use teleop_link::Dice;
 use teleop_robot::control::{ControlParams, Controller, Fault, PoseSample, TickRecord};
 use teleop_robot::driver::{DriverError, HandDriver, JointCommand, JointState, Pace, SimHand};
 use teleop_robot::receive::Receiver;
 use teleop_robot::runtime::{ControlThread, Realtime, Shared};
 use teleop_tests::eventually;
-use teleop_tests::relay::Dice;
 
 /// Counts the allocations of each thread by itself.
 struct Counting;

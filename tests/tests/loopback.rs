@@ -15,7 +15,7 @@ use teleop_common::time::{ClockOffset, Histogram, MonoTime};
 use teleop_common::wire::{
     Echo, HealthMessage, JointStateMessage, PoseMessage, REJECTIONS, Rejection, Stamper, pack_joints,
 };
-use teleop_tests::relay::{Impairment, UdpRelay};
+use teleop_link::{Impairment, Relay};
 
 const POSE: MasterPose = MasterPose { q: [0.25; 20], geometry: MasterGeometry::PARADIGMATIC, tuning: None };
 const PATIENCE: Duration = Duration::from_secs(20);
@@ -284,7 +284,7 @@ impl End {
 fn udp_with_delay_jitter_and_loss() {
     let (robot_session, locator) = listen("udp/127.0.0.1:0");
     let target: SocketAddr = locator.trim_start_matches("udp/").parse().unwrap();
-    let relay = UdpRelay::start(target, 42).unwrap();
+    let relay = Relay::udp(target, 42).unwrap();
     let operator_session = connect(&format!("udp/{}", relay.address()));
 
     let end = |epoch, ahead| Arc::new(End { epoch, ahead, state: Mutex::default() });

@@ -8,11 +8,11 @@ use teleop_common::hand::{HandModel, HandSide};
 use teleop_common::mode::Mode;
 use teleop_common::testing::shared_data;
 use teleop_common::wire::Rejection;
+use teleop_link::{Impairment, Relay};
 use teleop_tests::eventually;
 use teleop_tests::judge::{assert_limits, commands};
 use teleop_tests::probe::{Probe, moved};
 use teleop_tests::process::{Process, Robot, Signal, run};
-use teleop_tests::relay::{Impairment, UdpRelay};
 
 const MS: Duration = Duration::from_millis(1);
 const RATE: f64 = 333.0;
@@ -30,7 +30,7 @@ fn a_recorded_hand_drives_the_robot_over_a_bad_network() {
 
     // Over the bad link go poses and their answers; this test watches over a good one.
     let mut robot = Robot::listening(&["udp/127.0.0.1:0", "tcp/127.0.0.1:0"], &[]);
-    let relay = UdpRelay::start(robot.endpoints[0].trim_start_matches("udp/").parse().unwrap(), 20_260).unwrap();
+    let relay = Relay::udp(robot.endpoints[0].trim_start_matches("udp/").parse().unwrap(), 20_260).unwrap();
     let probe = Probe::connect(&robot.endpoints[1]);
     probe.wait_for(Mode::Disarmed);
     let far = format!("udp/{}", relay.address());
@@ -73,7 +73,7 @@ fn a_recorded_hand_drives_the_robot_over_a_bad_network() {
     assert!(health.poses_accepted >= FRAMES * 85 / 100, "{} poses obeyed", health.poses_accepted);
     // The relay delays by 15 ms or more; the clock's error is at most half of the jitter of both ways.
     assert!(age.p50 >= 10.0 && age.p50 < 150.0, "{age:?}");
-    assert!(relay.stats().lost > 0, "the relay lost nothing");
+    assert!(relay.stats().total().lost > 0, "the relay lost nothing");
     assert!(moved(&states, 0.3) >= 10, "{} joints moved", moved(&states, 0.3));
 
     replay(recorded, &folder);
