@@ -9,6 +9,7 @@
 //! | [`hand`] | the robot hand: URDF + description to a flat [`hand::HandModel`], forward kinematics, Jacobians |
 //! | [`master`] | the human hand: the paradigmatic 20-joint model, keypoint fit, calibration, gestures |
 //! | [`mapping`] | the combined joint-Cartesian mapping, Eq. 1-14 |
+//! | [`conditioner`] | from targets that may jump to commands within the limits |
 //! | [`guard`] | keeps the fingertips out of each other |
 //! | [`ik`] | bounded lexicographic inverse kinematics of one finger |
 //! | [`paper`] | the paper's tables and figures as numbers |
@@ -20,6 +21,7 @@
 //! | [`time`] | monotonic time as a number, clock offset, latency histogram |
 //! | [`testing`] | where tests find recordings |
 
+pub mod conditioner;
 pub mod guard;
 pub mod hand;
 pub mod ik;

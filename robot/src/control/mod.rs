@@ -6,10 +6,9 @@
 //!
 //! Nothing here reads a clock, locks, logs, waits or allocates.
 
-mod conditioner;
 mod controller;
 mod gate;
 
-pub use conditioner::{Conditioner, JointLimits};
 pub use controller::{ControlParams, Controller, Fault, PoseSample, TickRecord};
 pub use gate::{Gate, GateParams};
+pub use teleop_common::conditioner::{Conditioner, JointLimits};
