@@ -10,7 +10,7 @@
 //! | [`master`] | the human hand: the paradigmatic 20-joint model, keypoint fit, calibration, gestures |
 //! | [`mapping`] | the combined joint-Cartesian mapping, Eq. 1-14 |
 //! | [`conditioner`] | from targets that may jump to commands within the limits |
-//! | [`guard`] | keeps the fingertips out of each other |
+//! | [`guard`] | keeps fingertips, links and palm out of each other |
 //! | [`ik`] | bounded lexicographic inverse kinematics of one finger |
 //! | [`paper`] | the paper's tables and figures as numbers |
 //! | [`mode`] | what the robot is doing |

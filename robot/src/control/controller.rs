@@ -1,6 +1,6 @@
 use std::time::Duration;
 
-use teleop_common::guard::TipGuard;
+use teleop_common::guard::{MotionGuard, TipGuard};
 use teleop_common::hand::{HandModel, JointVector, MAX_FINGERS};
 use teleop_common::mapping::{MappingOutput, MappingParams, ParamError, Retargeter};
 use teleop_common::master::MasterPose;
@@ -101,6 +101,7 @@ pub struct Controller {
     params: ControlParams,
     retargeter: Retargeter,
     guard: TipGuard,
+    motion: MotionGuard,
     conditioner: Option<Conditioner>,
     mode: Mode,
     fault: Fault,
@@ -127,6 +128,7 @@ impl Controller {
         Ok(Self {
             params,
             guard: TipGuard::new(&hand, params.tip_overlap),
+            motion: MotionGuard::new(&hand, params.tip_overlap),
             retargeter: Retargeter::new(hand, mapping)?,
             conditioner: None,
             mode: Mode::Idle,
@@ -228,9 +230,9 @@ impl Controller {
                 // The limit widens tenfold over the ramp, then only the joints' own limits count.
                 let ramp = since < params.engage_ramp;
                 let widened = params.engage_speed * (1.0 + 9.0 * since / params.engage_ramp);
-                let (guard, hand, movable) = (&self.guard, retargeter.hand(), &self.movable);
+                let (guard, hand, movable) = (&self.motion, retargeter.hand(), &self.movable);
                 conditioner.follow(&self.target, if ramp { widened } else { f64::INFINITY }, |q, velocity, range| {
-                    guard.slow(hand, q, movable, velocity, range, 1.0 / params.rate);
+                    guard.guard(hand, q, movable, velocity, range, 1.0 / params.rate);
                 });
             }
             _ => conditioner.hold(),
