@@ -18,14 +18,19 @@ use nalgebra::Vector3;
 
 use super::direction;
 use crate::hand::{
-    Body, BodyIndex, Capsule, Frame, HandModel, JointVector, MAX_BODIES, MAX_FINGER_JOINTS, MAX_FINGERS, Nearest,
-    RoundedBox, between_segments,
+    Body, BodyIndex, Frame, HandModel, JointVector, MAX_BODIES, MAX_FINGER_JOINTS, MAX_FINGERS, Nearest,
+    between_segments,
 };
 
 /// No command brings two bodies further into each other, m. Two fingertips: or [`TIP_SLACK`] more than they may.
 pub const MAX_PENETRATION: f64 = 0.001;
-/// What rounding may take of it, m.
+/// A hand that starts with bodies this far inside each other (m) is on its own with them until they are apart: nothing
+/// says which way is out.
+const LOST: f64 = 0.005;
+/// What rounding may take of the penetration, m.
 const ROUNDING: f64 = 1e-6;
+/// Gaps that differ by less are the same, m.
+const SAME: f64 = 1e-9;
 /// Overlap of two tips over the allowance before they are held back, m, and before they are stopped.
 const SLACK: f64 = 0.0003;
 const TIP_SLACK: f64 = 0.0005;
@@ -39,7 +44,7 @@ const MAX_CONTACTS: usize = 32;
 /// A contact that parts slower than it should by less than this is as good, m/s.
 const SETTLED: f64 = 1e-5;
 /// Pairs proved at once; with more, everything brakes.
-const MAX_NEAR: usize = 192;
+const MAX_NEAR: usize = 128;
 /// Ticks of braking looked at; a hand that would take longer brakes before something near.
 const MAX_BRAKING: usize = 64;
 /// Times that the fingers of a pair are slowed further for the proof.
@@ -62,23 +67,36 @@ pub enum Intervention {
 /// Keeps the commands of one hand from collisions with itself.
 #[derive(Clone, Debug)]
 pub struct MotionGuard {
-    // Overlap at which two tips are held back, and at which they are stopped, m.
-    tips: [f64; 2],
-    // Furthest that a point of the axes of a body can be from each joint before it, m.
-    levers: Box<[[[f64; MAX_FINGER_JOINTS]; MAX_BODIES]; MAX_FINGERS]>,
+    pairs: Vec<Pair>,
+    // By body: radius of a sphere around it, m; furthest that a point of its axes can be from each joint before it, m.
+    sizes: [f64; BODIES],
+    levers: [[f64; MAX_FINGER_JOINTS]; BODIES],
 }
 
-/// What a body may run into.
-#[derive(Clone, Copy)]
+/// Room for the bodies of all fingers, those of one finger in a row.
+const BODIES: usize = MAX_FINGERS * MAX_BODIES;
+
+/// Two bodies, or a body and a box of the palm.
+#[derive(Clone, Copy, Debug)]
+struct Pair {
+    a: usize,
+    other: Other,
+    // Overlap at which they are held back, and at which they are stopped, m.
+    hold: f64,
+    stop: f64,
+}
+
+#[derive(Clone, Copy, Debug)]
 enum Other {
-    Body(BodyIndex),
+    Body(usize),
     Palm(usize),
 }
 
-/// A pair that is near, by its number, and the least gap it may get, m.
+/// A pair that is near: its number, its gap, and the least that it may get, m.
 #[derive(Clone, Copy, Default)]
 struct Near {
-    pair: usize,
+    pair: u16,
+    gap: f64,
     least: f64,
 }
 
@@ -91,36 +109,56 @@ struct List<T, const N: usize> {
 /// A pair of capsules: how fast its gap grows by the joints of the two fingers.
 #[derive(Clone, Copy, Default)]
 struct Contact {
-    joints: [usize; 2 * MAX_FINGER_JOINTS],
     slopes: [f64; 2 * MAX_FINGER_JOINTS],
+    joints: [u8; 2 * MAX_FINGER_JOINTS],
     // Of the finger that gives way. Without one that may, both do.
     moves: [bool; 2 * MAX_FINGER_JOINTS],
-    len: usize,
+    len: u8,
     room: f64,
 }
 
 /// The hand in a posture.
 struct World {
     frames: [[Frame; MAX_FINGER_JOINTS]; MAX_FINGERS],
-    bounds: [[Capsule; MAX_BODIES]; MAX_FINGERS],
+    // Axis of the capsule around each body, and its middle.
+    axes: [[Vector3<f64>; 2]; BODIES],
+    middles: [Vector3<f64>; BODIES],
 }
 
 impl MotionGuard {
     /// A guard of `hand` that lets the spheres of fingertips overlap by `allowance` (m).
     #[must_use]
     pub fn new(hand: &HandModel, allowance: f64) -> Self {
-        let mut levers = Box::new([[[0.0; MAX_FINGER_JOINTS]; MAX_BODIES]; MAX_FINGERS]);
-        for ((chain, bodies), levers) in hand.fingers.iter().zip(&hand.collision.fingers).zip(levers.iter_mut()) {
-            for (body, levers) in bodies.iter().zip(levers) {
+        let (mut sizes, mut levers) = ([0.0; BODIES], [[0.0; MAX_FINGER_JOINTS]; BODIES]);
+        for (finger, (chain, bodies)) in hand.fingers.iter().zip(&hand.collision.fingers).enumerate() {
+            for (index, body) in bodies.iter().enumerate() {
+                let [start, end] = body.bound.ends;
+                sizes[flat((finger, index))] = body.bound.radius + 0.5 * (end - start).norm();
                 let ends = body.capsules.iter().flat_map(|capsule| &capsule.ends);
                 let mut lever = ends.map(Vector3::norm).fold(0.0, f64::max);
                 for slot in (0..=body.slot).rev() {
-                    levers[slot] = lever;
+                    levers[flat((finger, index))][slot] = lever;
                     lever += chain.joints[slot].translation.norm();
                 }
             }
         }
-        Self { tips: [allowance + SLACK, (allowance + TIP_SLACK).max(MAX_PENETRATION)], levers }
+        let collision = &hand.collision;
+        let tip = |(finger, index): BodyIndex| collision.fingers[finger][index].tip;
+        let fingers = collision.pairs.iter().map(|&[a, b]| {
+            let [hold, stop] = if tip(a) && tip(b) {
+                [allowance + SLACK, (allowance + TIP_SLACK).max(MAX_PENETRATION)]
+            } else {
+                [0.0, MAX_PENETRATION]
+            };
+            Pair { a: flat(a), other: Other::Body(flat(b)), hold, stop }
+        });
+        let palm = collision.palm_pairs.iter().map(|&(a, block)| Pair {
+            a: flat(a),
+            other: Other::Palm(block),
+            hold: 0.0,
+            stop: MAX_PENETRATION,
+        });
+        Self { pairs: fingers.chain(palm).collect(), sizes, levers }
     }
 
     /// How far any two bodies that are kept apart are inside each other at `q` (rad, wire order), m; negative if all are
@@ -128,7 +166,7 @@ impl MotionGuard {
     #[must_use]
     pub fn deepest(&self, hand: &HandModel, q: &JointVector) -> f64 {
         let world = World::new(hand, q);
-        (0..pairs(hand)).map(|pair| self.may(hand, pair)[0] - world.gap(hand, pair)).fold(f64::NEG_INFINITY, f64::max)
+        self.pairs.iter().map(|pair| -pair.hold - world.gap(hand, pair)).fold(f64::NEG_INFINITY, f64::max)
     }
 
     /// Changes `velocity` (rad/s, wire order), about to be commanded at posture `q` (rad) for `period` seconds, so that
@@ -152,26 +190,26 @@ impl MotionGuard {
             let speed = low[index].abs().max(high[index].abs());
             travel[index] = speed * speed / joint.acceleration + 2.0 * speed * period;
         }
+        let ways = self.ways(hand, &travel);
         let mut near = List::<Near, MAX_NEAR>::new();
         let mut contacts = List::<Contact, MAX_CONTACTS>::new();
         let mut complete = true;
-        for pair in 0..pairs(hand) {
-            let [hold, stop] = self.may(hand, pair);
-            let reach = self.reach(hand, pair, &travel);
-            if world.clear(hand, pair, reach) {
+        for (index, pair) in self.pairs.iter().enumerate() {
+            let reach = pair.way(&ways);
+            if self.clear(hand, &world, pair, reach) {
                 continue;
             }
-            let mut gap = f64::INFINITY;
+            let gap = world.gap(hand, pair);
+            if gap + pair.hold >= reach || gap < -LOST {
+                continue;
+            }
+            complete &= near.push(Near { pair: index as u16, gap, least: gap.min(ROUNDING - pair.stop) });
             world.each(hand, pair, |points, radii| {
-                let own = (points[1] - points[0]).norm() - radii;
-                gap = gap.min(own);
-                if own + hold < reach {
-                    contacts.push_worst(world.contact(hand, pair, points, own + hold, movable));
+                let room = (points[1] - points[0]).norm() - radii + pair.hold;
+                if room < reach {
+                    contacts.push_worst(world.contact(hand, pair, points, room, movable));
                 }
             });
-            if gap + hold < reach {
-                complete &= near.push(Near { pair, least: gap.min(ROUNDING - stop) });
-            }
         }
         if near.len == 0 {
             return Intervention::None;
@@ -199,9 +237,7 @@ impl MotionGuard {
                 return if turns == [0; MAX_FINGERS] { slowed } else { Intervention::Braked };
             };
             let mut changed = false;
-            let ((a, _), other) = members(hand, pair);
-            let b = if let Other::Body((b, _)) = other { b } else { a };
-            for finger in [a, b] {
+            for finger in self.pairs[pair].fingers() {
                 changed |= turns[finger] + 1 < SHARES.len();
                 turns[finger] = (turns[finger] + 1).min(SHARES.len() - 1);
             }
@@ -223,16 +259,29 @@ impl MotionGuard {
         world: &mut World,
         period: f64,
     ) -> Option<usize> {
-        let (mut x, mut v, mut open) = (*q, *velocity, near.clone());
-        let mut travel = JointVector::zeros(q.len());
+        let (mut x, mut v) = (*q, *velocity);
+        // What each joint has to go: v, v - a dt, .. for a tick each; and in the next tick alone.
+        let (mut travel, mut step) = (JointVector::zeros(q.len()), JointVector::zeros(q.len()));
+        let braking = |speed: f64, acceleration: f64| speed * speed / (2.0 * acceleration) + speed * period;
+        for (index, joint) in hand.joints.iter().enumerate() {
+            travel[index] = braking(v[index].abs(), joint.acceleration);
+        }
+        let mut open = List::<Near, MAX_NEAR>::new();
+        let ways = self.ways(hand, &travel);
+        let mut involved = [false; MAX_FINGERS];
+        for item in &near.items[..near.len] {
+            let pair = &self.pairs[usize::from(item.pair)];
+            // What is too far away for the way to brake needs no look.
+            if item.gap < item.least + pair.way(&ways) {
+                open.push(*item);
+                pair.fingers().for_each(|finger| involved[finger] = true);
+            }
+        }
+        // Ticks for which nothing can get too near.
+        let mut idle = 0;
         for _ in 0..MAX_BRAKING {
-            let mut involved = [false; MAX_FINGERS];
-            for item in &open.items[..open.len] {
-                let ((a, _), other) = members(hand, item.pair);
-                involved[a] = true;
-                if let Other::Body((b, _)) = other {
-                    involved[b] = true;
-                }
+            if open.len == 0 {
+                return None;
             }
             for (finger, chain) in hand.fingers.iter().enumerate().filter(|(finger, _)| involved[*finger]) {
                 for joint in &chain.joints {
@@ -240,50 +289,81 @@ impl MotionGuard {
                     x[index] = (x[index] + v[index] * period).clamp(limits.lower, limits.upper);
                     let speed = (v[index].abs() - limits.acceleration * period).max(0.0);
                     v[index] = speed.copysign(v[index]);
-                    // What is left to go: n a dt + (n - 1) a dt + .. for n ticks, and a rest of less than a tick.
-                    travel[index] = speed * speed / (2.0 * limits.acceleration) + speed * period;
+                    travel[index] = braking(speed, limits.acceleration);
+                    step[index] = speed * period;
                 }
-                world.place(hand, finger, &x);
+                if idle == 0 {
+                    world.place(hand, finger, &x);
+                }
             }
+            if idle > 0 {
+                idle -= 1;
+                continue;
+            }
+            let (ways, steps) = (self.ways(hand, &travel), self.ways(hand, &step));
+            idle = MAX_BRAKING;
             let mut index = 0;
             while index < open.len {
-                let Near { pair, least } = open.items[index];
-                let reach = self.reach(hand, pair, &travel);
-                if world.clear(hand, pair, least + reach) {
+                let Near { pair: number, least, .. } = open.items[index];
+                let pair = &self.pairs[usize::from(number)];
+                let reach = least + pair.way(&ways);
+                if self.clear(hand, world, pair, reach) {
                     open.remove(index);
                     continue;
                 }
                 let gap = world.gap(hand, pair);
-                if gap < least - 1e-9 {
-                    return Some(pair);
+                if gap < least - SAME {
+                    return Some(usize::from(number));
                 }
-                if gap >= least + reach - 1e-9 { open.remove(index) } else { index += 1 }
-            }
-            if open.len == 0 {
-                return None;
+                if gap >= reach - SAME {
+                    open.remove(index);
+                } else {
+                    idle = idle.min(((gap - least).max(0.0) / pair.way(&steps)) as usize);
+                    index += 1;
+                }
             }
         }
-        Some(open.items[0].pair)
+        (open.len > 0).then(|| usize::from(open.items[0].pair))
     }
 
-    /// Overlap (m) at which a pair is held back, and at which it is stopped.
-    fn may(&self, hand: &HandModel, pair: usize) -> [f64; 2] {
-        match members(hand, pair) {
-            (a, Other::Body(b)) if body(hand, a).tip && body(hand, b).tip => self.tips,
-            _ => [0.0, MAX_PENETRATION],
+    /// The most that each body can move if each joint travels as far as `travel` (rad), m.
+    fn ways(&self, hand: &HandModel, travel: &JointVector) -> [f64; BODIES] {
+        let mut out = [0.0; BODIES];
+        for (finger, (chain, bodies)) in hand.fingers.iter().zip(&hand.collision.fingers).enumerate() {
+            for index in 0..bodies.len() {
+                let body = flat((finger, index));
+                let levers = self.levers[body].iter().zip(&chain.joints);
+                out[body] = levers.map(|(lever, joint)| lever * travel[joint.joint]).sum();
+            }
         }
+        out
     }
 
-    /// The most that a pair can close if each joint travels as far as `travel` (rad), m.
-    fn reach(&self, hand: &HandModel, pair: usize, travel: &JointVector) -> f64 {
-        let way = |(finger, body): BodyIndex| {
-            let joints = hand.fingers[finger].joints.iter();
-            joints.zip(&self.levers[finger][body]).map(|(joint, lever)| lever * travel[joint.joint]).sum::<f64>()
+    /// True if a pair is further apart than `reach` for sure.
+    #[inline]
+    fn clear(&self, hand: &HandModel, world: &World, pair: &Pair, reach: f64) -> bool {
+        // Spheres first, they are cheap.
+        let (apart, size) = match pair.other {
+            Other::Body(b) => ((world.middles[b] - world.middles[pair.a]).norm_squared(), self.sizes[b]),
+            Other::Palm(block) => {
+                let block = &hand.collision.palm[block];
+                (block.squared(&world.middles[pair.a]), block.radius)
+            }
         };
-        match members(hand, pair) {
-            (a, Other::Body(b)) => way(a) + way(b),
-            (a, Other::Palm(_)) => way(a),
-        }
+        let size = self.sizes[pair.a] + size + reach;
+        apart > size * size || world.bounds_clear(hand, pair, reach)
+    }
+}
+
+impl Pair {
+    /// The most that the gap can close, m.
+    fn way(&self, ways: &[f64; BODIES]) -> f64 {
+        ways[self.a] + if let Other::Body(b) = self.other { ways[b] } else { 0.0 }
+    }
+
+    fn fingers(&self) -> impl Iterator<Item = usize> {
+        let other = if let Other::Body(b) = self.other { Some(b / MAX_BODIES) } else { None };
+        std::iter::once(self.a / MAX_BODIES).chain(other)
     }
 }
 
@@ -311,8 +391,7 @@ fn relax(
     for _ in 0..SWEEPS {
         let mut settled = true;
         for (contact, allowed) in contacts.iter().zip(&allowed) {
-            let joints = contact.joints.iter().zip(&contact.slopes).take(contact.len);
-            let parting: f64 = joints.map(|(&joint, slope)| slope * velocity[joint]).sum();
+            let parting: f64 = contact.own(true).map(|(joint, slope)| slope * velocity[joint]).sum();
             if parting >= allowed - SETTLED {
                 continue;
             }
@@ -340,17 +419,17 @@ fn relax(
 impl Contact {
     /// Joints that give way, and what they do to the gap, m/rad.
     fn own(&self, all: bool) -> impl Iterator<Item = (usize, f64)> {
-        let joints = self.joints.iter().copied().zip(self.slopes.iter().copied()).zip(self.moves).take(self.len);
-        joints.filter(move |(_, moves)| all || *moves).map(|(joint, _)| joint)
+        let joints = self.joints.iter().zip(&self.slopes).zip(&self.moves).take(usize::from(self.len));
+        joints.filter(move |(_, moves)| all || **moves).map(|((&joint, &slope), _)| (usize::from(joint), slope))
     }
 }
 
 impl World {
     fn new(hand: &HandModel, q: &JointVector) -> Self {
-        let nothing = Capsule { ends: [Vector3::zeros(); 2], radius: 0.0 };
         let mut out = Self {
             frames: [[Frame::default(); MAX_FINGER_JOINTS]; MAX_FINGERS],
-            bounds: [[nothing; MAX_BODIES]; MAX_FINGERS],
+            axes: [[Vector3::zeros(); 2]; BODIES],
+            middles: [Vector3::zeros(); BODIES],
         };
         for finger in 0..hand.fingers.len() {
             out.place(hand, finger, q);
@@ -360,65 +439,47 @@ impl World {
 
     fn place(&mut self, hand: &HandModel, finger: usize, q: &JointVector) {
         let chain = &hand.fingers[finger];
-        chain.frames(&chain.select(q)[..chain.joints.len()], &mut self.frames[finger]);
-        for (body, bound) in hand.collision.fingers[finger].iter().zip(&mut self.bounds[finger]) {
-            *bound = self.frames[finger][body.slot].capsule(&body.bound);
+        let frames = &mut self.frames[finger];
+        chain.frames(&chain.select(q)[..chain.joints.len()], frames);
+        for (index, body) in hand.collision.fingers[finger].iter().enumerate() {
+            let axis = frames[body.slot].capsule(&body.bound).ends;
+            self.middles[flat((finger, index))] = (axis[0] + axis[1]) * 0.5;
+            self.axes[flat((finger, index))] = axis;
         }
     }
 
-    /// True if a pair is further apart than `reach` for sure.
-    fn clear(&self, hand: &HandModel, pair: usize, reach: f64) -> bool {
-        let ((finger, body), other) = members(hand, pair);
-        let own = &self.bounds[finger][body];
-        // Spheres first, they are cheap.
-        let middle = |ends: &[Vector3<f64>; 2]| (ends[0] + ends[1]) * 0.5;
-        let half = |ends: &[Vector3<f64>; 2]| (ends[1] - ends[0]).norm_squared().sqrt() * 0.5;
-        let far = |center: Vector3<f64>, radius: f64| {
-            let apart = own.radius + half(&own.ends) + radius + reach;
-            (center - middle(&own.ends)).norm_squared() > apart * apart
+    /// The same by the capsules around the bodies.
+    fn bounds_clear(&self, hand: &HandModel, pair: &Pair, reach: f64) -> bool {
+        let own = &self.axes[pair.a];
+        let ([p, q], radius) = match pair.other {
+            Other::Body(b) => (between_segments(own, &self.axes[b]), body(hand, b).bound.radius),
+            Other::Palm(block) => (hand.collision.palm[block].nearest(own), hand.collision.palm[block].radius),
         };
-        let (points, radius) = match other {
-            Other::Body((finger, body)) => {
-                let other = &self.bounds[finger][body];
-                if far(middle(&other.ends), other.radius + half(&other.ends)) {
-                    return true;
-                }
-                (between_segments(&own.ends, &other.ends), other.radius)
-            }
-            Other::Palm(block) => {
-                let block = &hand.collision.palm[block];
-                if far(block.pose.translation.vector, block.radius + block.half.norm()) {
-                    return true;
-                }
-                (block.nearest(&own.ends), block.radius)
-            }
-        };
-        let apart = own.radius + radius + reach;
-        (points[1] - points[0]).norm_squared() > apart * apart
+        let size = body(hand, pair.a).bound.radius + radius + reach;
+        (q - p).norm_squared() > size * size
     }
 
     /// The gap of a pair, m.
-    fn gap(&self, hand: &HandModel, pair: usize) -> f64 {
+    fn gap(&self, hand: &HandModel, pair: &Pair) -> f64 {
         let mut gap = f64::INFINITY;
         self.each(hand, pair, |points, radii| gap = gap.min((points[1] - points[0]).norm() - radii));
         gap
     }
 
     /// The nearest points of the axes of all the capsules of a pair, and the sum of their radii.
-    fn each(&self, hand: &HandModel, pair: usize, mut visit: impl FnMut(Nearest, f64)) {
-        let (a, other) = members(hand, pair);
-        for own in &body(hand, a).capsules {
-            let own = self.frames[a.0][body(hand, a).slot].capsule(own);
-            match other {
+    fn each(&self, hand: &HandModel, pair: &Pair, mut visit: impl FnMut(Nearest, f64)) {
+        let frame = |index: usize| &self.frames[index / MAX_BODIES][body(hand, index).slot];
+        for own in &body(hand, pair.a).capsules {
+            let own = frame(pair.a).capsule(own);
+            match pair.other {
                 Other::Body(b) => {
-                    let frame = &self.frames[b.0][body(hand, b).slot];
                     for other in &body(hand, b).capsules {
-                        let other = frame.capsule(other);
+                        let other = frame(b).capsule(other);
                         visit(between_segments(&own.ends, &other.ends), own.radius + other.radius);
                     }
                 }
                 Other::Palm(block) => {
-                    let block: &RoundedBox = &hand.collision.palm[block];
+                    let block = &hand.collision.palm[block];
                     visit(block.nearest(&own.ends), own.radius + block.radius);
                 }
             }
@@ -428,52 +489,40 @@ impl World {
     fn contact(
         &self,
         hand: &HandModel,
-        pair: usize,
+        pair: &Pair,
         points: Nearest,
         room: f64,
         movable: &[bool; MAX_FINGERS],
     ) -> Contact {
         let normal = direction(points[1] - points[0]);
-        let (a, other) = members(hand, pair);
         let mut out = Contact { room, ..Contact::default() };
-        let mut add = |(finger, index): BodyIndex, point: Vector3<f64>, sign: f64, moves: bool| {
-            let slots = 0..=body(hand, (finger, index)).slot;
+        let anyone = pair.fingers().any(|finger| movable[finger]);
+        let mut add = |index: usize, point: Vector3<f64>, sign: f64| {
+            let finger = index / MAX_BODIES;
+            let slots = 0..=body(hand, index).slot;
             for (joint, frame) in hand.fingers[finger].joints[slots].iter().zip(&self.frames[finger]) {
-                out.joints[out.len] = joint.joint;
-                out.slopes[out.len] = sign * frame.axis.cross(&(point - frame.position)).dot(&normal);
-                out.moves[out.len] = moves;
+                let slot = usize::from(out.len);
+                out.joints[slot] = joint.joint as u8;
+                out.slopes[slot] = sign * frame.axis.cross(&(point - frame.position)).dot(&normal);
+                out.moves[slot] = movable[finger] || !anyone;
                 out.len += 1;
             }
         };
-        if let Other::Body(b) = other {
-            let neither = !movable[a.0] && !movable[b.0];
-            add(a, points[0], -1.0, movable[a.0] || neither);
-            add(b, points[1], 1.0, movable[b.0] || neither);
-        } else {
-            add(a, points[0], -1.0, true);
+        add(pair.a, points[0], -1.0);
+        if let Other::Body(b) = pair.other {
+            add(b, points[1], 1.0);
         }
         out
     }
 }
 
-/// How many pairs there are; those of fingers come first.
-fn pairs(hand: &HandModel) -> usize {
-    hand.collision.pairs.len() + hand.collision.palm_pairs.len()
+/// The number of a body.
+const fn flat((finger, index): BodyIndex) -> usize {
+    finger * MAX_BODIES + index
 }
 
-fn members(hand: &HandModel, pair: usize) -> (BodyIndex, Other) {
-    let collision = &hand.collision;
-    match collision.pairs.get(pair) {
-        Some(&[a, b]) => (a, Other::Body(b)),
-        None => {
-            let (a, block) = collision.palm_pairs[pair - collision.pairs.len()];
-            (a, Other::Palm(block))
-        }
-    }
-}
-
-fn body(hand: &HandModel, (finger, index): BodyIndex) -> &Body {
-    &hand.collision.fingers[finger][index]
+fn body(hand: &HandModel, index: usize) -> &Body {
+    &hand.collision.fingers[index / MAX_BODIES][index % MAX_BODIES]
 }
 
 impl<T: Copy + Default, const N: usize> List<T, N> {

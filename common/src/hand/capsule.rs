@@ -1,6 +1,6 @@
 //! Round shapes and how far they are apart.
 
-use nalgebra::{Isometry3, Point3, Vector3};
+use nalgebra::{Matrix3, Vector3};
 
 /// A segment with a radius; a sphere if its ends are one point.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -14,8 +14,10 @@ pub struct Capsule {
 /// A box with round edges: everything within `radius` of its core, a smaller box.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct RoundedBox {
-    /// Pose of the core, which is centred on it with edges along the axes, m.
-    pub pose: Isometry3<f64>,
+    /// Centre, m.
+    pub center: Vector3<f64>,
+    /// Directions of the edges, by column.
+    pub edges: Matrix3<f64>,
     /// Half the core's edges, m; may be zero.
     pub half: Vector3<f64>,
     /// Radius of the edges, m.
@@ -44,13 +46,20 @@ pub(crate) fn between_segments(a: &[Vector3<f64>; 2], b: &[Vector3<f64>; 2]) -> 
 }
 
 impl RoundedBox {
+    /// Squared distance of a point and the core, m^2.
+    #[inline]
+    pub(crate) fn squared(&self, point: &Vector3<f64>) -> f64 {
+        let local = self.edges.tr_mul(&(point - self.center));
+        local.zip_map(&self.half, |value, half| (value.abs() - half).max(0.0)).norm_squared()
+    }
+
     /// The nearest points of a segment and the core.
     ///
     /// The squared distance along the segment is convex with a derivative that is linear between the planes of the
     /// faces, so its zero is between the two of those crossings that bracket it.
     #[inline]
     pub(crate) fn nearest(&self, segment: &[Vector3<f64>; 2]) -> Nearest {
-        let local = segment.map(|end| self.pose.inverse_transform_point(&Point3::from(end)).coords);
+        let local = segment.map(|end| self.edges.tr_mul(&(end - self.center)));
         let along = local[1] - local[0];
         let inside = |at: Vector3<f64>| at.zip_map(&self.half, |value, half| value.clamp(-half, half));
         let slope = |t: f64| {
@@ -75,12 +84,13 @@ impl RoundedBox {
             low.0 - low.1 * (high.0 - low.0) / (high.1 - low.1)
         };
         let at = local[0] + along * t;
-        [at, inside(at)].map(|point| self.pose.transform_point(&Point3::from(point)).coords)
+        [at, inside(at)].map(|point| self.center + self.edges * point)
     }
 }
 
 #[cfg(test)]
 mod tests {
+    use nalgebra::Rotation3;
     use proptest::prelude::*;
 
     use super::*;
@@ -119,13 +129,10 @@ mod tests {
             place in point(),
             turn in prop::array::uniform3(-3.0..3.0_f64),
         ) {
-            let pose = Isometry3::new(place, Vector3::from(turn));
-            let shape = RoundedBox { pose, half: Vector3::from(half), radius: 0.0 };
+            let edges = Rotation3::new(Vector3::from(turn)).into_inner();
+            let shape = RoundedBox { center: place, edges, half: Vector3::from(half), radius: 0.0 };
             let [p, q] = shape.nearest(&ends);
-            let best = least(|t| {
-                let at = pose.inverse_transform_point(&Point3::from(ends[0] + (ends[1] - ends[0]) * t)).coords;
-                at.zip_map(&shape.half, |value, half| (value.abs() - half).max(0.0)).norm_squared()
-            })
+            let best = least(|t| shape.squared(&(ends[0] + (ends[1] - ends[0]) * t)))
             .sqrt();
             prop_assert!(((q - p).norm() - best).abs() < 1e-6, "{} for {best}", (q - p).norm());
         }

@@ -222,15 +222,21 @@ impl Solid {
         }
     }
 
+    /// As a box in the frame in which the link has pose `pose`.
     fn rounded(&self, pose: &Isometry3<f64>) -> RoundedBox {
-        match self {
-            Self::Capsule { origin, radius, half } => {
-                RoundedBox { pose: pose * origin, half: Vector3::z() * *half, radius: *radius }
-            }
+        let (origin, half, radius) = match self {
+            Self::Capsule { origin, radius, half } => (origin, Vector3::z() * *half, *radius),
             Self::Box { origin, half } => {
                 let radius = half.min().min(EDGE);
-                RoundedBox { pose: pose * origin, half: half.map(|half| half - radius), radius }
+                (origin, half.map(|half| half - radius), radius)
             }
+        };
+        let pose = pose * origin;
+        RoundedBox {
+            center: pose.translation.vector,
+            edges: pose.rotation.to_rotation_matrix().into_inner(),
+            half,
+            radius,
         }
     }
 }
