@@ -10,7 +10,8 @@
 //! | [`hand`] | the robot hand: URDF + description to a flat [`hand::HandModel`], forward kinematics, Jacobians |
 //! | [`master`] | the human hand: the paradigmatic 20-joint model, keypoint fit, calibration, gestures |
 //! | [`mapping`] | the combined joint-Cartesian mapping, Eq. 1-14 |
-//! | [`guard`] | keeps the fingertips out of each other |
+//! | [`conditioner`] | from targets that may jump to commands within the limits |
+//! | [`guard`] | keeps fingertips, links and palm out of each other |
 //! | [`ik`] | bounded lexicographic inverse kinematics of one finger |
 //! | [`paper`] | the paper's tables and figures as numbers |
 //! | [`mode`] | what the robot is doing |
@@ -23,6 +24,7 @@
 //! | [`testing`] | where tests find recordings |
 
 pub mod authority;
+pub mod conditioner;
 pub mod guard;
 pub mod hand;
 pub mod ik;

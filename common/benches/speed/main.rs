@@ -2,6 +2,7 @@
 //! `cargo bench -p teleop-common [-- PART-OF-A-NAME]`; instructions per call: `deploy/bench`.
 #![allow(clippy::print_stdout, clippy::unwrap_used, missing_docs, reason = "a bench reports on the terminal")]
 
+mod motion;
 mod suite;
 
 use std::fs::File;
@@ -59,6 +60,8 @@ fn main() {
     mapping(&mut suite, "tour, vector", &hand, mode(MappingMode::Vector), &tour);
     mapping(&mut suite, "tour, dexpilot", &hand, mode(MappingMode::DexPilot), &tour);
     codec(&mut suite, &tour);
+    motion::poses(&mut suite, "tour", &hand, &tour, RATE);
+    motion::jumps(&mut suite, &hand);
 
     let Some((calibration, keypoints)) = recording() else { return };
     perception(&mut suite, &calibration, &keypoints);
@@ -67,6 +70,7 @@ fn main() {
         let poses = tracked(&calibration, &hand, &keypoints);
         let name = format!("recording, {}", side.name());
         mapping(&mut suite, &name, &hand, MappingParams::default(), &poses);
+        motion::poses(&mut suite, &name, &hand, &poses, RECORDED_RATE);
         if side == HandSide::Right {
             // The joint mapping alone, with what is left of the step where nothing is solved.
             for (name, thumb_map) in [("angles", ThumbMap::Angles), ("directions", ThumbMap::Directions)] {

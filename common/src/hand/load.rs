@@ -9,7 +9,8 @@ use super::description::{Anatomical, Description, FingerEntry, Joints};
 use super::joint_map::joint_maps;
 use super::urdf::{Motion, Tree, TreeJoint};
 use super::{
-    ChainJoint, Finger, FingerChain, HandError, HandModel, HandSide, Joint, Link, MAX_FINGER_JOINTS, MAX_JOINTS,
+    ChainJoint, Collision, Finger, FingerChain, HandError, HandModel, HandSide, Joint, Link, MAX_FINGER_JOINTS,
+    MAX_JOINTS,
 };
 
 /// Largest text of either kind, bytes.
@@ -29,7 +30,7 @@ impl HandModel {
         if let Some(problem) = too_large(description_toml) {
             return Err(HandError::DescriptionSyntax(problem));
         }
-        let tree = Tree::parse(urdf_xml)?;
+        let mut tree = Tree::parse(urdf_xml)?;
         let description: Description = toml::from_str(description_toml).map_err(|error| {
             let line = error.span().map_or(0, |span| description_toml[..span.start].matches('\n').count());
             HandError::DescriptionSyntax(format!("line {}: {}", line + 1, error.message()))
@@ -46,6 +47,9 @@ impl HandModel {
             joints.iter().enumerate().map(|(index, joint)| (joint.name.as_str(), index)).collect();
         let fingers = fingers(&tree, &wire, &description.finger, &anatomical_from_palm)?;
         check_use(&tree, &wire, &fingers)?;
+        let entry = |chain: &FingerChain| description.finger.iter().find(|entry| entry.name == chain.finger);
+        let centers: Vec<&str> = fingers.iter().filter_map(entry).map(|entry| entry.center.as_str()).collect();
+        let collision = Collision::build(&mut tree, &fingers, &centers, &joints)?;
         let joint_maps = joint_maps(&description.joint_map, &joints)?;
         let links = tree
             .links
@@ -73,6 +77,7 @@ impl HandModel {
             wrist,
             joint_maps,
             links,
+            collision,
             warnings: tree.warnings,
         })
     }

@@ -9,6 +9,8 @@
 //! written once.
 
 mod allegro;
+mod capsule;
+mod collision;
 mod description;
 mod error;
 mod joint_map;
@@ -23,8 +25,12 @@ pub use allegro::{
     ALLEGRO_V4_LEFT_DESCRIPTION, ALLEGRO_V4_LEFT_URDF, ALLEGRO_V4_RIGHT_DESCRIPTION, ALLEGRO_V4_RIGHT_URDF,
     allegro_v4_texts,
 };
+pub use capsule::{Capsule, RoundedBox};
+pub(crate) use capsule::{Nearest, between_segments};
+pub use collision::{Body, BodyIndex, Collision, MAX_BODIES};
 pub use error::HandError;
 pub use link::{Link, Shape, Visual};
+pub(crate) use model::Frame;
 pub use model::{ChainJoint, FingerChain, HandModel, Joint, JointMap, JointMapTerm, TipFrame, TipJacobian};
 pub use vector::JointVector;
 

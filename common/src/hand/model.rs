@@ -1,6 +1,6 @@
 use nalgebra::{Matrix3, Vector3};
 
-use super::{Finger, HandSide, JointVector, Link, MAX_FINGER_JOINTS};
+use super::{Capsule, Collision, Finger, HandSide, JointVector, Link, MAX_FINGER_JOINTS};
 
 /// One actuated joint of the hand.
 #[derive(Clone, Debug)]
@@ -87,6 +87,26 @@ pub struct FingerChain {
     pub length: f64,
 }
 
+/// Where a moving link is, in the palm frame (m), and the axis of its joint.
+#[derive(Clone, Copy, Default)]
+pub(crate) struct Frame {
+    pub(crate) position: Vector3<f64>,
+    pub(crate) rotation: Matrix3<f64>,
+    pub(crate) axis: Vector3<f64>,
+}
+
+impl Frame {
+    #[inline]
+    pub(crate) fn point(&self, own: &Vector3<f64>) -> Vector3<f64> {
+        self.position + self.rotation * own
+    }
+
+    #[inline]
+    pub(crate) fn capsule(&self, own: &Capsule) -> Capsule {
+        Capsule { ends: [self.point(&own.ends[0]), self.point(&own.ends[1])], radius: own.radius }
+    }
+}
+
 /// Linear Jacobian of a fingertip, 3 x n (columns beyond the finger's joints are zero), m/rad, in the palm frame.
 pub type TipJacobian = nalgebra::SMatrix<f64, 3, MAX_FINGER_JOINTS>;
 
@@ -147,6 +167,18 @@ impl FingerChain {
         }
         let tip = position + rotation * self.offset(frame);
         (tip, std::array::from_fn(|slot| axes[slot].cross(&(tip - origins[slot]))), axes)
+    }
+
+    /// Frames of the moving links, palm outwards, for the finger's own joint angles `q` (rad).
+    #[inline]
+    pub(crate) fn frames(&self, q: &[f64], out: &mut [Frame; MAX_FINGER_JOINTS]) {
+        let mut position = Vector3::zeros();
+        let mut rotation = Matrix3::identity();
+        for ((joint, &angle), frame) in self.joints.iter().zip(q).zip(out) {
+            position += rotation * joint.translation;
+            rotation *= joint.rotation_at(angle);
+            *frame = Frame { position, rotation, axis: rotation * joint.axis };
+        }
     }
 
     /// The finger's own joint angles out of the whole hand's `q`, palm outwards.
@@ -228,6 +260,8 @@ pub struct HandModel {
     pub joint_maps: Vec<JointMap>,
     /// All links with their shapes, for drawing: the root (the palm frame) first, parents before children.
     pub links: Vec<Link>,
+    /// The hand's shape and what of it is kept apart.
+    pub collision: Collision,
     /// What the texts contain but the model leaves out, for the caller to log.
     pub warnings: Vec<String>,
 }

@@ -32,6 +32,21 @@ pub(super) struct TreeLink {
     /// Index of the parent link and the joint to it; `None` for the root.
     pub(super) parent: Option<(usize, TreeJoint)>,
     pub(super) visuals: Vec<Visual>,
+    pub(super) solids: Vec<Solid>,
+}
+
+/// A collision shape, centred on its origin in the link's frame, m.
+pub(super) enum Solid {
+    Box {
+        origin: Isometry3<f64>,
+        half: Vector3<f64>,
+    },
+    /// Along z; a sphere if `half`, half the length of its axis, is zero.
+    Capsule {
+        origin: Isometry3<f64>,
+        radius: f64,
+        half: f64,
+    },
 }
 
 #[derive(Clone)]
@@ -106,9 +121,10 @@ impl Tree {
         while let Some((index, parent)) = queue.pop_front() {
             let link = &robot.links[index];
             let visuals = visuals(link, &materials, &mut tree.warnings)?;
+            let solids = solids(link, &mut tree.warnings)?;
             queue.extend(children[index].iter().map(|&child| (child, Some(tree.links.len()))));
             let parent = parent.zip(parents[index].take().map(|(_, joint)| joint));
-            tree.links.push(TreeLink { name: link.name.clone(), parent, visuals });
+            tree.links.push(TreeLink { name: link.name.clone(), parent, visuals, solids });
         }
         // With one root and at most one parent each, links that were not reached run in a circle.
         if let Some(index) = parents.iter().position(Option::is_some) {
@@ -248,13 +264,7 @@ fn visuals(
                 HandError::urdf(element.clone(), format!("material '{}' is not defined", brief(&material.name)))
             })?,
         };
-        let size = |value: f64| {
-            if value > 0.0 && value <= MAX_LENGTH {
-                return Ok(value);
-            }
-            let problem = format!("a visual's size of {value} must be above 0 and within {MAX_LENGTH} m");
-            Err(HandError::urdf(element.clone(), problem))
-        };
+        let size = |value: f64| check_size(value, "visual", &element);
         let mut push = |shape, origin| out.push(Visual { shape, origin, rgba });
         match &visual.geometry {
             Geometry::Box { size: edges } => {
@@ -282,4 +292,45 @@ fn visuals(
         }
     }
     Ok(out)
+}
+
+fn solids(link: &urdf_rs::Link, warnings: &mut Vec<String>) -> Result<Vec<Solid>, HandError> {
+    let element = format!("link '{}'", link.name);
+    let size = |value: f64| check_size(value, "collision shape", &element);
+    let mut out = Vec::with_capacity(link.collision.len());
+    for collision in &link.collision {
+        let origin = check_origin(&collision.origin, &element)?;
+        out.push(match &collision.geometry {
+            Geometry::Box { size: edges } => {
+                let [x, y, z] = **edges;
+                Solid::Box { origin, half: Vector3::new(size(x)?, size(y)?, size(z)?) * 0.5 }
+            }
+            // A flat one is nearer to a box than to a capsule.
+            Geometry::Cylinder { radius, length } if size(*length)? < 2.0 * size(*radius)? => {
+                Solid::Box { origin, half: Vector3::new(*radius, *radius, 0.5 * length) }
+            }
+            Geometry::Cylinder { radius, length } => {
+                Solid::Capsule { origin, radius: *radius, half: 0.5 * length - radius }
+            }
+            Geometry::Capsule { radius, length } => {
+                Solid::Capsule { origin, radius: size(*radius)?, half: 0.5 * size(*length)? }
+            }
+            Geometry::Sphere { radius } => Solid::Capsule { origin, radius: size(*radius)?, half: 0.0 },
+            Geometry::Mesh { filename, .. } => {
+                warnings.push(format!(
+                    "{element}: collision mesh '{}' is not watched; only box, cylinder, capsule and sphere are",
+                    brief(filename)
+                ));
+                continue;
+            }
+        });
+    }
+    Ok(out)
+}
+
+fn check_size(value: f64, what: &str, element: &str) -> Result<f64, HandError> {
+    if value > 0.0 && value <= MAX_LENGTH {
+        return Ok(value);
+    }
+    Err(HandError::urdf(element, format!("a {what}'s size of {value} must be above 0 and within {MAX_LENGTH} m")))
 }

@@ -35,12 +35,14 @@ impl JointVector {
 impl Deref for JointVector {
     type Target = [f64];
 
+    #[inline]
     fn deref(&self) -> &[f64] {
         &self.data[..self.len]
     }
 }
 
 impl DerefMut for JointVector {
+    #[inline]
     fn deref_mut(&mut self) -> &mut [f64] {
         &mut self.data[..self.len]
     }

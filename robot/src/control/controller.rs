@@ -2,7 +2,7 @@ use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 use teleop_common::authority::{Heard, Intent, Latch, Machine, MachineParams};
-use teleop_common::guard::TipGuard;
+use teleop_common::guard::{MotionGuard, TipGuard};
 use teleop_common::hand::{HandModel, JointVector, MAX_FINGERS};
 use teleop_common::mapping::{MappingOutput, MappingParams, ParamError, Retargeter};
 use teleop_common::master::MasterPose;
@@ -167,6 +167,7 @@ pub struct Controller {
     params: ControlParams,
     retargeter: Retargeter,
     guard: TipGuard,
+    motion: MotionGuard,
     conditioner: Option<Conditioner>,
     machine: Machine,
     playout: Playout,
@@ -194,6 +195,7 @@ impl Controller {
         Ok(Self {
             params,
             guard: TipGuard::new(&hand, params.tip_overlap),
+            motion: MotionGuard::new(&hand, params.tip_overlap),
             retargeter: Retargeter::new(hand, mapping)?,
             conditioner: None,
             machine: Machine::new(MachineParams {
@@ -295,20 +297,22 @@ impl Controller {
             .conditioner
             .get_or_insert_with(|| Conditioner::new(hand, &state.q, 1.0 / params.rate, params.smoothing));
         let (mut torque, mut limp) = (1.0, false);
-        let mut follow = |conditioner: &mut Conditioner, target: &JointVector, speed: f64| {
-            let (guard, movable) = (&self.guard, &self.movable);
-            conditioner.follow(target, speed, |q, velocity, range| {
-                guard.slow(hand, q, movable, velocity, range, 1.0 / params.rate);
-            });
-        };
+        let follow =
+            |conditioner: &mut Conditioner, target: &JointVector, speed: f64, movable: &[bool; MAX_FINGERS]| {
+                conditioner.follow(target, speed, |q, velocity, range| {
+                    self.motion.guard(hand, q, movable, velocity, range, 1.0 / params.rate);
+                });
+            };
         match mode {
             // The limit widens tenfold over the ramp, then only the joints' own limits count.
             Mode::Engaging => {
                 let widened = params.engage_speed * (1.0 + 9.0 * lasted / params.engage_ramp);
-                follow(conditioner, &self.target, widened);
+                follow(conditioner, &self.target, widened, &self.movable);
             }
-            Mode::Engaged => follow(conditioner, &self.target, f64::INFINITY),
-            Mode::Relaxed if params.relax == Relax::Open => follow(conditioner, &hand.home(), params.engage_speed),
+            Mode::Engaged => follow(conditioner, &self.target, f64::INFINITY, &self.movable),
+            Mode::Relaxed if params.relax == Relax::Open => {
+                follow(conditioner, &hand.home(), params.engage_speed, &[true; MAX_FINGERS]);
+            }
             _ => {
                 conditioner.hold();
                 torque = if mode == Mode::Relaxed && params.relax == Relax::Yield { YIELD } else { 1.0 };

@@ -6,8 +6,7 @@
 //!
 //! Nothing here reads a clock, locks, logs, waits or allocates.
 
-mod conditioner;
 mod controller;
 
-pub use conditioner::{Conditioner, JointLimits};
 pub use controller::{ControlParams, Controller, Fault, PoseSample, Relax, StopAction, TickRecord};
+pub use teleop_common::conditioner::{Conditioner, JointLimits};

@@ -1,4 +1,4 @@
-//! Keeps the fingertips out of each other.
+//! Targets: keeps the fingertips out of each other.
 //!
 //! The mapping brings the *poles* of two fingertips together, which is where two fingers touch only if they meet tip
 //! to tip; at any other angle their spheres (12 mm for the Allegro) overlap, by 9 mm at worst. The guard moves a
@@ -16,6 +16,7 @@
 
 use nalgebra::{SMatrix, SVector, Vector3};
 
+use super::direction;
 use crate::hand::{HandModel, Joint, JointVector, MAX_FINGERS, MAX_JOINTS, TipFrame, TipJacobian};
 
 const MAX_PAIRS: usize = MAX_FINGERS * (MAX_FINGERS - 1) / 2;
@@ -39,16 +40,7 @@ const TOLERANCE: f64 = 2e-5;
 /// Below this step (rad) the posture has settled.
 const SETTLED: f64 = 1e-3;
 
-/// Sweeps over the pairs when slowing.
-const SLOW_SWEEPS: usize = 6;
-/// Room between two fingertips from which on nobody has to brake, m.
-const BRAKING: f64 = 0.06;
-/// Overlap on the way, over the allowance, m.
-const SLACK: f64 = 0.0003;
-/// How fast an overlap is undone, 1/s.
-const PUSH: f64 = 20.0;
-
-/// The guard of one hand.
+/// Keeps the fingertips of one hand's target postures apart.
 #[derive(Clone, Debug)]
 pub struct TipGuard {
     // Radius of each fingertip's sphere, m.
@@ -136,73 +128,6 @@ impl TipGuard {
         if self.deepest_of(count, &now.map(|tip| tip.center)) <= self.deepest_of(count, &before) { x } else { *q }
     }
 
-    /// Slows fingertips that approach each other so that they can still brake before they touch, and turns those that
-    /// overlap too much apart: the change of `velocity` (rad/s, wire order) at posture `q` that is least in the squares.
-    ///
-    /// Postures far apart may have fingertips in each other's way; this guards the way from one to the other. Each
-    /// joint stays between `low` and `high` (rad/s), which is what it can do in the next tick, `period` seconds. `movable`
-    /// is as in [`TipGuard::apart`]. Does not allocate; bounded work.
-    pub fn slow(
-        &self,
-        hand: &HandModel,
-        q: &JointVector,
-        movable: &[bool; MAX_FINGERS],
-        velocity: &mut JointVector,
-        [low, high]: [&JointVector; 2],
-        period: f64,
-    ) {
-        let mut tips = [(Vector3::zeros(), TipJacobian::zeros()); MAX_FINGERS];
-        for (tip, chain) in tips.iter_mut().zip(&hand.fingers) {
-            *tip = chain.tip_and_jacobian(&chain.select(q)[..chain.joints.len()], TipFrame::Center);
-        }
-        for _ in 0..SLOW_SWEEPS {
-            let mut slowed = false;
-            for (a, b) in pairs(hand.fingers.len()) {
-                let between = tips[b].0 - tips[a].0;
-                let distance = between.norm();
-                let room = distance - (self.radii[a] + self.radii[b] - self.allowance - SLACK);
-                if room > BRAKING {
-                    continue;
-                }
-                let normal = between.try_normalize(1e-9).unwrap_or_else(Vector3::x);
-                let neither = !movable[a] && !movable[b];
-                let sides = || {
-                    let (tips, fingers) = (&tips, &hand.fingers);
-                    [(a, -1.0), (b, 1.0)].into_iter().flat_map(move |(finger, sign)| {
-                        let moves = movable[finger] || neither;
-                        fingers[finger].joints.iter().enumerate().map(move |(slot, joint)| {
-                            (joint.joint, sign * tips[finger].1.column(slot).dot(&normal), moves)
-                        })
-                    })
-                };
-                // Speed at which the centres part, and how much of it can be gained a second.
-                let (mut parting, mut gain, mut grip) = (0.0, 0.0, 0.0);
-                for (joint, slope, moves) in sides() {
-                    parting += slope * velocity[joint];
-                    if moves {
-                        gain += slope.abs() * hand.joints[joint].acceleration;
-                        grip += slope * slope;
-                    }
-                }
-                // Half of what the joints can do is left to what else they have to do.
-                let allowed = if room > 0.0 { -(gain * room).sqrt().min(0.5 * room / period) } else { -room * PUSH };
-                if parting >= allowed || grip < 1e-12 {
-                    continue;
-                }
-                slowed = true;
-                let share = (allowed - parting) / grip;
-                for (joint, slope, moves) in sides() {
-                    if moves {
-                        velocity[joint] = (velocity[joint] + slope * share).max(low[joint]).min(high[joint]);
-                    }
-                }
-            }
-            if !slowed {
-                break;
-            }
-        }
-    }
-
     fn deepest_of(&self, count: usize, centers: &Centers) -> f64 {
         pairs(count).map(|(a, b)| self.overlap(centers, a, b)).fold(f64::NEG_INFINITY, f64::max)
     }
@@ -283,8 +208,7 @@ impl TipGuard {
             let distance = between.norm();
             let lacking = self.radii[a] + self.radii[b] - self.allowance - distance;
             if lacking > -NEAR {
-                // Centres in one place: any direction is as good.
-                let normal = between.try_normalize(1e-9).unwrap_or_else(Vector3::x);
+                let normal = direction(between);
                 let jacobian = place(a, &now[a].center_jacobian, -1.0) + place(b, &now[b].center_jacobian, 1.0);
                 slack[close] = Pair { slope: jacobian.tr_mul(&normal), lacking, multiplier: 0.0 };
                 close += 1;

@@ -1,4 +1,6 @@
-use teleop_common::hand::{HandModel, JointVector, MAX_JOINTS};
+//! From targets that may jump to commands that a hand can follow.
+
+use crate::hand::{HandModel, JointVector, MAX_JOINTS};
 
 /// Limits of one joint's command.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -165,9 +167,9 @@ fn brakeable(distance: f64, acceleration: f64, period: f64) -> f64 {
 #[cfg(test)]
 mod tests {
     use proptest::prelude::*;
-    use teleop_common::hand::HandSide;
 
     use super::*;
+    use crate::hand::HandSide;
 
     const PERIOD: f64 = 0.003;
 
