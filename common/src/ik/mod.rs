@@ -29,7 +29,7 @@ mod scan;
 use nalgebra::Vector3;
 
 use self::descent::Problem;
-use self::scan::{FLOOR_MARGIN, SEEDS, Scan, Start};
+use self::scan::{SEEDS, Scan, Start};
 use crate::hand::{FingerChain, Joint, MAX_FINGER_JOINTS, TipFrame};
 
 const N: usize = MAX_FINGER_JOINTS;
@@ -182,10 +182,7 @@ impl FingerIk {
             Seeds::Scan(scan) => {
                 for seed in scan.run(&problem.target, &problem.reference, problem.weight, known) {
                     if seed.cost.is_finite() {
-                        // A valley's floor can lie lower than its node by what half a step of the scan does.
-                        let margin = problem.weight * FLOOR_MARGIN
-                            + if seed.reached { 0.0 } else { 1e-3 * (2.0 * seed.cost).sqrt() };
-                        take(&seed.q, seed.cost - margin);
+                        take(&seed.q, seed.floor(problem.weight));
                     }
                 }
             }
