@@ -113,9 +113,14 @@ impl Retargeter {
                 anchor = self.cartesian.thumb(&pose.geometry, &meeting);
                 out.p_cartesian = palm_from_anatomical * anchor;
                 if self.params.anchor == Anchor::Projected {
-                    let start = self.last_anchor.as_ref();
-                    let (nearest, _) =
-                        self.solvers[slot].solve(chain, &out.p_cartesian, &posture, start, posture_weight(k_thumb));
+                    let (solver, weight) = (&self.solvers[slot], posture_weight(k_thumb));
+                    let nearest = match &self.last_anchor {
+                        // Nothing hangs on the thumb yet, so its signal is all that has to go on.
+                        Some(start) if k_thumb == 0.0 => {
+                            solver.follow(chain, &out.p_cartesian, &posture, start, weight)
+                        }
+                        start => solver.solve(chain, &out.p_cartesian, &posture, start.as_ref(), weight).0,
+                    };
                     self.last_anchor = Some(nearest);
                     out.p_cartesian = chain.tip(&nearest, TipFrame::Pole);
                     anchor = self.hand.anatomical_from_palm * out.p_cartesian;
