@@ -29,7 +29,7 @@ mod scan;
 use nalgebra::Vector3;
 
 use self::descent::Problem;
-use self::scan::{FLOOR_MARGIN, SEEDS, Scan, Start};
+use self::scan::{SEEDS, Scan, Start};
 use crate::hand::{FingerChain, Joint, MAX_FINGER_JOINTS, TipFrame};
 
 const N: usize = MAX_FINGER_JOINTS;
@@ -127,14 +127,7 @@ impl FingerIk {
         posture_weight: f64,
     ) -> ([f64; N], IkReport) {
         let mu = posture_weight.clamp(POSTURE_WEIGHT_MIN, POSTURE_WEIGHT_MAX);
-        let problem = Problem {
-            chain,
-            target: *target,
-            reference: *reference,
-            weight: mu * mu,
-            lower: &self.lower,
-            upper: &self.upper,
-        };
+        let problem = self.problem(chain, target, reference, mu);
         let kept = start.map(|start| problem.descend(start, BUDGET));
         let mut iterations = kept.map_or(0, |kept| kept.iterations);
         let mut best = kept;
@@ -176,16 +169,38 @@ impl FingerIk {
         (taken.q, IkReport { status, iterations, residual: taken.residual, jumped })
     }
 
+    /// [`FingerIk::solve`] that stays in the valley of `start` whatever other valleys cost: for a third of the time.
+    #[must_use]
+    pub fn follow(
+        &self,
+        chain: &FingerChain,
+        target: &Vector3<f64>,
+        reference: &[f64; N],
+        start: &[f64; N],
+        posture_weight: f64,
+    ) -> [f64; N] {
+        let mu = posture_weight.clamp(POSTURE_WEIGHT_MIN, POSTURE_WEIGHT_MAX);
+        self.problem(chain, target, reference, mu).descend(start, BUDGET).q
+    }
+
+    fn problem<'a>(
+        &'a self,
+        chain: &'a FingerChain,
+        target: &Vector3<f64>,
+        reference: &Angles,
+        mu: f64,
+    ) -> Problem<'a> {
+        let (lower, upper) = (&self.lower, &self.upper);
+        Problem { chain, target: *target, reference: *reference, weight: mu * mu, lower, upper }
+    }
+
     /// Calls `take(posture, lower bound of the cost in its valley)` for the starts worth a descent, the best first.
     fn for_each_seed(&self, problem: &Problem<'_>, known: Option<Start>, mut take: impl FnMut(&Angles, f64)) {
         match &self.seeds {
             Seeds::Scan(scan) => {
                 for seed in scan.run(&problem.target, &problem.reference, problem.weight, known) {
                     if seed.cost.is_finite() {
-                        // A valley's floor can lie lower than its node by what half a step of the scan does.
-                        let margin = problem.weight * FLOOR_MARGIN
-                            + if seed.reached { 0.0 } else { 1e-3 * (2.0 * seed.cost).sqrt() };
-                        take(&seed.q, seed.cost - margin);
+                        take(&seed.q, seed.floor(problem.weight));
                     }
                 }
             }

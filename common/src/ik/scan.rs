@@ -178,6 +178,8 @@ struct Pass<'a> {
     wish: [f64; 4],
     weight: f64,
     cap: f64,
+    // Squared length at and beyond which even the floor of a valley out of reach costs more than the cap.
+    dear: f64,
     // Whether to look for the ends of valleys.
     ends: bool,
     // Whether postures count that do not reach the target.
@@ -259,7 +261,8 @@ impl Pass<'_> {
                 best.iter_mut().for_each(|seed| seed.reached = true);
                 continue;
             }
-            scan.arm((Plane::new(at.x, radius) - shoulder) * back, self.near, |side, alpha, beta, miss| {
+            let room = if self.near { self.dear - offset } else { 0.0 };
+            scan.arm((Plane::new(at.x, radius) - shoulder) * back, room, |side, alpha, beta, miss| {
                 let posture = (alpha - self.wish[2]).powi(2) + (beta - self.wish[3]).powi(2);
                 let cost = 0.5 * (offset + miss + self.weight * posture);
                 if cost < best[side].cost {
@@ -302,7 +305,9 @@ impl Valleys {
 const NODE_MARGIN: f64 = 0.2;
 /// How much less the square of that distance can be between two nodes than at a node that has less than its neighbours,
 /// rad², roughly.
-pub(super) const FLOOR_MARGIN: f64 = 0.03;
+const FLOOR_MARGIN: f64 = 0.03;
+/// How much less the length `sqrt(2 J)` can be between two nodes where the target is out of reach, m, roughly.
+const NEAR_MARGIN: f64 = 1e-3;
 
 /// What is known from a descent before.
 #[derive(Clone, Copy)]
@@ -325,6 +330,12 @@ pub(super) struct Seed {
 
 impl Seed {
     const NONE: Self = Self { q: [0.0; N], cost: f64::INFINITY, reached: false };
+
+    /// The least that a posture of its valley can cost, m²: the floor can lie lower than the node.
+    pub(super) fn floor(&self, weight: f64) -> f64 {
+        let near = if self.reached { 0.0 } else { NEAR_MARGIN * (2.0 * self.cost).sqrt() };
+        self.cost - weight * FLOOR_MARGIN - near
+    }
 }
 
 impl Scan {
@@ -430,10 +441,12 @@ impl Scan {
         nodes.add(angle, Plane::from_polar(1.0, angle));
         self.events(&way, &mut nodes);
         let cap = start.map_or(f64::INFINITY, |start| start.cap);
-        let ends = start.is_none();
-        let mut pass = Pass { scan: self, rolls: self.rolls(&way.fixed), way, wish, weight, cap, ends, near: false };
+        // The length whose floor is the cap, see [`Seed::floor`].
+        let dear = (NEAR_MARGIN + (NEAR_MARGIN.powi(2) + 2.0 * (cap + weight * FLOOR_MARGIN)).sqrt()).powi(2);
+        let (ends, near) = (start.is_none(), start.is_some_and(|start| !start.reached));
+        let mut pass = Pass { scan: self, rolls: self.rolls(&way.fixed), way, wish, weight, cap, dear, ends, near };
         let mut found = pass.valleys(&nodes);
-        if start.is_none_or(|start| !start.reached) && found[0].cost == f64::INFINITY {
+        if start.is_none() && found[0].cost == f64::INFINITY {
             pass.near = true;
             found = pass.valleys(&nodes);
         }
@@ -490,9 +503,9 @@ impl Scan {
         })
     }
 
-    /// Calls `take(side, alpha, beta, squared miss)` for every posture of the planar arm that reaches `way`, or else, if
-    /// `near`, for the nearest on every arc of its boundary; `side` is how the elbow is bent.
-    fn arm(&self, way: Plane, near: bool, mut take: impl FnMut(usize, f64, f64, f64)) {
+    /// Calls `take(side, alpha, beta, squared miss)` for every posture of the planar arm that reaches `way`, or else for
+    /// the nearest on every arc of its boundary with a squared miss below `room`, m²; `side` is how the elbow is bent.
+    fn arm(&self, way: Plane, room: f64, mut take: impl FnMut(usize, f64, f64, f64)) {
         let [first, second] = self.links;
         let [a, b] = self.lengths;
         let square = way.norm_sqr();
@@ -515,27 +528,32 @@ impl Scan {
                 }
             }
         }
-        if reached || !near {
+        if reached || room <= 0.0 {
             return;
         }
         let distance = square.sqrt();
-        let direction = atan2_of(way);
         for stiff in &self.stiff {
-            let wanted = direction - stiff.direction;
-            let (alpha, inside) = self.alpha.clip(wanted);
-            let miss = if inside {
-                (distance - stiff.length).powi(2)
-            } else {
-                let end = usize::from((alpha - self.alpha.upper).abs() < (alpha - self.alpha.lower).abs());
-                (way - stiff.ends[end]).norm_sqr()
-            };
-            take(self.side(stiff.beta), alpha, stiff.beta, miss);
+            // The nearest of the whole circle.
+            let beside = (distance - stiff.length).powi(2);
+            if beside < room {
+                let (alpha, inside) = self.alpha.clip(atan2_of(way) - stiff.direction);
+                let miss = if inside {
+                    beside
+                } else {
+                    let end = usize::from((alpha - self.alpha.upper).abs() < (alpha - self.alpha.lower).abs());
+                    (way - stiff.ends[end]).norm_sqr()
+                };
+                take(self.side(stiff.beta), alpha, stiff.beta, miss);
+            }
         }
         for (alpha, end) in [self.alpha.lower, self.alpha.upper].into_iter().zip(self.alpha_ends) {
             let rest = way * end.conj() - first;
-            let (beta, inside) = self.beta.clip(atan2_of(rest * second.conj()));
-            if inside {
-                take(self.side(beta), alpha, beta, (rest.norm_sqr().sqrt() - b).powi(2));
+            let miss = (rest.norm_sqr().sqrt() - b).powi(2);
+            if miss < room {
+                let (beta, inside) = self.beta.clip(atan2_of(rest * second.conj()));
+                if inside {
+                    take(self.side(beta), alpha, beta, miss);
+                }
             }
         }
     }

@@ -2,7 +2,8 @@ use nalgebra::Vector3;
 
 use super::{
     Anchor, Baseline, CartesianMap, FingerSignals, Gain, MappingMode, MappingOutput, MappingParams, ParamError,
-    ThumbGain, ThumbMap, thumb::ThumbShape,
+    ThumbGain, ThumbMap,
+    thumb::{ThumbPosture, ThumbShape},
 };
 use crate::hand::{Finger, FingerChain, HandModel, JointMap, JointVector, MAX_FINGER_JOINTS, MAX_FINGERS, TipFrame};
 use crate::ik::{FingerIk, POSTURE_WEIGHT_MAX};
@@ -21,7 +22,7 @@ pub struct Retargeter {
     gain: Gain,
     solvers: Vec<FingerIk>,
     thumb_shape: Option<ThumbShape>,
-    last_shape: Option<[f64; MAX_FINGER_JOINTS]>,
+    last_shape: Option<ThumbPosture>,
     // Last solution per finger, and of the thumb's projection.
     last: [Option<[f64; MAX_FINGER_JOINTS]>; MAX_FINGERS],
     last_anchor: Option<[f64; MAX_FINGER_JOINTS]>,
@@ -112,9 +113,14 @@ impl Retargeter {
                 anchor = self.cartesian.thumb(&pose.geometry, &meeting);
                 out.p_cartesian = palm_from_anatomical * anchor;
                 if self.params.anchor == Anchor::Projected {
-                    let start = self.last_anchor.as_ref();
-                    let (nearest, _) =
-                        self.solvers[slot].solve(chain, &out.p_cartesian, &posture, start, posture_weight(k_thumb));
+                    let (solver, weight) = (&self.solvers[slot], posture_weight(k_thumb));
+                    let nearest = match &self.last_anchor {
+                        // Nothing hangs on the thumb yet, so its signal is all that has to go on.
+                        Some(start) if k_thumb == 0.0 => {
+                            solver.follow(chain, &out.p_cartesian, &posture, start, weight)
+                        }
+                        start => solver.solve(chain, &out.p_cartesian, &posture, start.as_ref(), weight).0,
+                    };
                     self.last_anchor = Some(nearest);
                     out.p_cartesian = chain.tip(&nearest, TipFrame::Pole);
                     anchor = self.hand.anatomical_from_palm * out.p_cartesian;
@@ -141,8 +147,8 @@ impl Retargeter {
         if let (true, Some(chain), Some(shape)) = (by_directions, thumb, &self.thumb_shape) {
             let palm_from_anatomical = self.hand.anatomical_from_palm.transpose();
             let own = shape.solve(chain, &palm_from_anatomical, pose, self.last_shape.as_ref());
+            chain.scatter(&own.q, &mut q);
             self.last_shape = Some(own);
-            chain.scatter(&own, &mut q);
         }
         q
     }

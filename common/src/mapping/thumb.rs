@@ -17,9 +17,7 @@ const REST: f64 = 0.1;
 const LOOK: usize = 4;
 /// Steps of the descent from there.
 const ITERATIONS: usize = 20;
-/// A posture this good (weighted squares of unit vectors: a dozen degrees) is not compared with others.
-const GOOD: f64 = 0.05;
-/// By how much another valley must be better to be gone to: some 20 degrees of one bone.
+/// By how much another valley must be better to be gone to (weighted squares of unit vectors): some 20 degrees of a bone.
 const LEAVE: f64 = 0.12;
 /// How far apart two postures are to be in two valleys, rad.
 const APART: f64 = 0.8;
@@ -63,24 +61,33 @@ impl ThumbShape {
 
     /// The thumb's joint angles (rad, palm outwards) for the human's pose.
     ///
-    /// From `last`, the posture before this one in a motion, the thumb stays in its valley until another is clearly
+    /// From `last`, what was found before this in a motion, the thumb stays in its valley until another is clearly
     /// deeper: two postures as good as each other must not take turns.
     pub(super) fn solve(
         &self,
         chain: &FingerChain,
         palm_from_anatomical: &Matrix3<f64>,
         pose: &MasterPose,
-        last: Option<&[f64; MAX_FINGER_JOINTS]>,
-    ) -> [f64; MAX_FINGER_JOINTS] {
+        last: Option<&ThumbPosture>,
+    ) -> ThumbPosture {
         let wanted = wanted(palm_from_anatomical, pose);
-        let mut out = [0.0; MAX_FINGER_JOINTS];
         match self {
-            Self::Three(shape) => out[..3].copy_from_slice(shape.solve(chain, &wanted, last).as_slice()),
-            Self::Four(shape) => out[..4].copy_from_slice(shape.solve(chain, &wanted, last).as_slice()),
-            Self::Five(shape) => out.copy_from_slice(shape.solve(chain, &wanted, last).as_slice()),
+            Self::Three(shape) => shape.solve(chain, &wanted, last),
+            Self::Four(shape) => shape.solve(chain, &wanted, last),
+            Self::Five(shape) => shape.solve(chain, &wanted, last),
         }
-        out
     }
+}
+
+/// A posture of the thumb, and what is known of all others.
+#[derive(Clone, Debug)]
+pub(super) struct ThumbPosture {
+    /// Joint angles, rad, palm outwards.
+    pub(super) q: [f64; MAX_FINGER_JOINTS],
+    // The human's bones when all valleys were last compared, and the square root of the least cost then. That is a
+    // distance from them, so for other bones it is less by no more than those are away.
+    seen: Bones,
+    least: f64,
 }
 
 /// The same for a thumb of C joints.
@@ -120,20 +127,28 @@ impl<const C: usize> Shape<C> {
         shape
     }
 
-    fn solve(&self, chain: &FingerChain, wanted: &Bones, last: Option<&[f64; MAX_FINGER_JOINTS]>) -> SVector<f64, C> {
-        let kept = last.map(|last| self.descend(chain, wanted, SVector::from_fn(|slot, _| last[slot]), ITERATIONS));
-        if let Some((cost, q)) = kept
-            && cost < GOOD
+    fn solve(&self, chain: &FingerChain, wanted: &Bones, last: Option<&ThumbPosture>) -> ThumbPosture {
+        let posture = |q: SVector<f64, C>, seen: Bones, least: f64| {
+            let mut out = ThumbPosture { q: [0.0; MAX_FINGER_JOINTS], seen, least };
+            out.q[..C].copy_from_slice(q.as_slice());
+            out
+        };
+        let kept = last.map(|last| {
+            let (own, q) = self.descend(chain, wanted, SVector::from_fn(|slot, _| last.q[slot]), ITERATIONS);
+            (own, q, last, (last.least - distance(wanted, &last.seen)).max(0.0))
+        });
+        if let Some((own, q, last, others)) = kept
+            && own < others * others + LEAVE
         {
-            return q;
+            return posture(q, last.seen, last.least);
         }
         // The two best valleys; the cost of the first few steps tells which is the deeper one.
         let [first, second] = self.starts(wanted).map(|start| self.descend(chain, wanted, start, LOOK));
         let (_, q) = if second.0 < first.0 { second } else { first };
         let (cost, q) = self.descend(chain, wanted, q, ITERATIONS);
         match kept {
-            Some((own, kept)) if own < cost + LEAVE => kept,
-            _ => q,
+            Some((own, kept, ..)) if own < cost + LEAVE => posture(kept, *wanted, cost.min(own).sqrt()),
+            _ => posture(q, *wanted, cost.sqrt()),
         }
     }
 
@@ -217,6 +232,11 @@ fn wanted(palm_from_anatomical: &Matrix3<f64>, pose: &MasterPose) -> Bones {
     [second - base, third - second, tip - third].map(|bone| palm_from_anatomical * bone.normalize())
 }
 
+/// How far apart two triples are, weighted as the cost weighs them.
+fn distance(a: &Bones, b: &Bones) -> f64 {
+    (0..3).map(|bone| (WEIGHTS[bone] * (a[bone] - b[bone])).norm_squared()).sum::<f64>().sqrt()
+}
+
 fn slope_sum(slopes: &Bones, bones: &Bones) -> f64 {
     slopes.iter().zip(bones).map(|(slope, bone)| slope.dot(bone)).sum()
 }
@@ -292,7 +312,7 @@ mod tests {
             for _ in 0..300 {
                 let pose = random_pose(&mut state);
                 let wanted = wanted(&palm, &pose);
-                let q = shape.solve(chain, &wanted, None);
+                let q = SVector::from_fn(|slot, _| shape.solve(chain, &wanted, None).q[slot]);
                 let cost = |q: &SVector<f64, 4>| shape.cost(&wanted, &bones(chain, q).0, q);
                 let found = cost(&q);
                 // A random search that narrows down.
@@ -324,7 +344,7 @@ mod tests {
         let (chain, shape) = (&hand.fingers[0], ThumbShape::new(&hand).unwrap());
         let palm = hand.anatomical_from_palm.transpose();
         let leaps = |history: bool| {
-            let (mut state, mut leaps, mut last) = (3, 0, None::<[f64; MAX_FINGER_JOINTS]>);
+            let (mut state, mut leaps, mut last) = (3, 0, None::<ThumbPosture>);
             for _ in 0..50 {
                 let [from, to] = [random_pose(&mut state), random_pose(&mut state)];
                 for step in 0..200 {
@@ -332,11 +352,10 @@ mod tests {
                     for (angle, end) in pose.q.iter_mut().zip(&to.q) {
                         *angle += (end - *angle) * f64::from(step) / 200.0;
                     }
-                    let q = shape.solve(chain, &palm, &pose, last.as_ref().filter(|_| history && step > 0));
-                    if let (Some(last), true) = (last.replace(q), step > 0) {
-                        leaps += usize::from(
-                            (SVector::<f64, MAX_FINGER_JOINTS>::from(q) - SVector::from(last)).amax() > 0.2,
-                        );
+                    let now = shape.solve(chain, &palm, &pose, last.as_ref().filter(|_| history && step > 0));
+                    let q = SVector::from(now.q);
+                    if let (Some(last), true) = (last.replace(now), step > 0) {
+                        leaps += usize::from((q - SVector::from(last.q)).amax() > 0.2);
                     }
                 }
             }
@@ -358,7 +377,7 @@ mod tests {
                 let pose = random_pose(&mut state);
                 let mut near = pose;
                 near.q[..4].iter_mut().for_each(|angle| *angle += 1e-3 * (random(&mut state) - 0.5));
-                let solve = |pose| SVector::from(shape.solve(&hand.fingers[0], &palm, pose, None));
+                let solve = |pose| SVector::from(shape.solve(&hand.fingers[0], &palm, pose, None).q);
                 (solve(&near) - solve(&pose)).amax()
             })
             .collect();
