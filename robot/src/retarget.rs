@@ -11,11 +11,10 @@ use std::time::{Duration, Instant};
 
 use anyhow::Context as _;
 use indicatif::{ProgressBar, ProgressStyle};
-use teleop_common::authority::{Clutch, Intent, Latch};
+use teleop_common::authority::{Clutch, Latch};
 use teleop_common::hand::{HandModel, JointVector, TipFrame};
 use teleop_common::mapping::{FingerSignals, MappingOutput, Retargeter};
 use teleop_common::master::MasterPose;
-use teleop_common::mode::Mode;
 use teleop_common::quality::{Quality, Sample};
 use teleop_common::time::MonoTime;
 
@@ -185,18 +184,8 @@ impl Live {
         let at = |seconds: f64| MonoTime(((seconds - start) * 1e9).max(0.0) as u64);
         self.sequence += 1;
         // A recording wants to be followed from the first frame to the last, whatever the gaps.
-        let ready = self.controller.mode() == Mode::Armed || self.controller.mode().follows();
-        self.clutch = if ready { self.clutch.close() } else { self.clutch.open() };
-        let sample = PoseSample {
-            pose: *pose,
-            epoch: 1,
-            sequence: self.sequence,
-            captured_remote: at(t),
-            captured: at(t),
-            sent: at(t),
-            received: at(t),
-            intent: Intent { clutch: self.clutch, ..Intent::default() },
-        };
+        self.clutch = self.clutch.eager(self.controller.mode());
+        let sample = PoseSample::instant(at(t), self.sequence, *pose, self.clutch);
         self.controller.admit(&sample);
         let end = at(next);
         loop {

@@ -70,8 +70,6 @@ const MS: u64 = 1_000_000;
 const RATE: f64 = 333.0;
 const PERIOD: Duration = Duration::from_nanos(3_003_003);
 const HOLD_AFTER: Duration = Duration::from_millis(200);
-/// Longest allowance for the period of the source.
-const MAX_PERIOD: Duration = Duration::from_millis(100);
 
 /// A controller and a simulated hand that tick in virtual time.
 struct Bench {
@@ -121,28 +119,14 @@ impl Bench {
     /// A pose that arrives now.
     fn sample(&mut self, pose: MasterPose, sequence: u64) -> PoseSample {
         if self.eager {
-            self.clutch = eager(self.clutch, self.controller.mode());
+            self.clutch = self.clutch.eager(self.controller.mode());
         }
-        PoseSample {
-            pose,
-            intent: self.intent(),
-            epoch: 7,
-            sequence,
-            captured_remote: self.now,
-            captured: self.now,
-            sent: self.now,
-            received: self.now,
-        }
+        PoseSample { epoch: 7, ..PoseSample::instant(self.now, sequence, pose, self.clutch) }
     }
 
     fn intent(&self) -> Intent {
         Intent { clutch: self.clutch, ..Intent::default() }
     }
-}
-
-/// The clutch of an operator that closes it whenever the robot is ready, and sees at once what the robot does.
-fn eager(clutch: Clutch, mode: Mode) -> Clutch {
-    if mode == Mode::Armed || mode.follows() { clutch.close() } else { clutch.open() }
 }
 
 fn pose(gesture: Gesture, t: f64) -> MasterPose {
@@ -197,7 +181,7 @@ fn assert_no_allocation(mapping: MappingParams) {
             while let Ok(sample) = poses.pop() {
                 bench.controller.admit(&sample);
             }
-            bench.clutch = eager(bench.clutch, bench.controller.mode());
+            bench.clutch = bench.clutch.eager(bench.controller.mode());
             let record = bench.tick(None);
             modes[record.mode as usize] += 1;
         }

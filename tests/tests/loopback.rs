@@ -330,6 +330,8 @@ fn udp_with_delay_jitter_and_loss() {
                 dq: pack_joints(&[0.0; 16]),
                 tau: pack_joints(&[0.0; 16]),
                 q_command: pack_joints(&[0.1; 16]),
+                stop: 0,
+                holder: 0,
             };
             states.send(&message).unwrap();
             std::thread::sleep(5 * MS);

@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use serde_json::Value;
+use teleop_common::authority::{Clutch, Latch};
 use teleop_common::hand::{Finger, HandModel, HandSide, JointVector, TipFrame};
 use teleop_common::mapping::{MappingParams, Retargeter};
 use teleop_common::master::{Gesture, MasterGeometry, MasterPose};
@@ -341,18 +342,12 @@ fn live(motion: &[(f64, [f64; 20])], side: HandSide) -> (Vec<JointVector>, Vec<C
     let mut commands = vec![Command { epoch: 0, tick: 0, q: hand.home() }];
     let mut controller = Controller::new(hand, MappingParams::default(), params).unwrap();
     let at = |t: f64| MonoTime(((t - motion[0].0) * 1e9) as u64);
-    let (mut rows, mut tick) = (Vec::new(), 0_u64);
+    let (mut rows, mut tick, mut clutch) = (Vec::new(), 0_u64, Clutch::default());
     let period = motion[motion.len() - 1].0 - motion[motion.len() - 2].0;
     for (index, (t, q)) in motion.iter().enumerate() {
-        let received = at(*t);
-        let sample = PoseSample {
-            pose: MasterPose { q: *q, geometry: MasterGeometry::PARADIGMATIC, tuning: None },
-            epoch: 5,
-            sequence: index as u64,
-            captured_remote: received,
-            captured: received,
-            received,
-        };
+        let pose = MasterPose { q: *q, geometry: MasterGeometry::PARADIGMATIC, tuning: None };
+        clutch = clutch.eager(controller.mode());
+        controller.admit(&PoseSample::instant(at(*t), index as u64, pose, clutch));
         let end = at(motion.get(index + 1).map_or(t + period, |(next, _)| *next));
         loop {
             let now = MonoTime((tick as f64 * 1e9 / params.rate) as u64);
@@ -361,7 +356,7 @@ fn live(motion: &[(f64, [f64; 20])], side: HandSide) -> (Vec<JointVector>, Vec<C
             }
             tick += 1;
             let state = driver.read(Duration::ZERO).unwrap();
-            let record = controller.tick(now, Some(&sample), &state);
+            let record = controller.tick(now, Latch::default(), &state);
             driver.write(&record.command).unwrap();
             commands.push(Command { epoch: 0, tick, q: record.command.q });
         }

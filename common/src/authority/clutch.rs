@@ -1,3 +1,5 @@
+use crate::mode::Mode;
+
 /// The operator's clutch (deadman switch): how often it was moved. Odd: closed, the robot may follow. Even: open.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Clutch(pub u32);
@@ -19,6 +21,13 @@ impl Clutch {
     #[must_use]
     pub const fn open(self) -> Self {
         if self.is_closed() { Self(self.0.wrapping_add(1)) } else { self }
+    }
+
+    /// As an operator moves it that wants to be followed at once and always, and sees what the robot does without delay:
+    /// closed when the robot is ready, opened after a hold. For simulations; in front of a real hand a person decides.
+    #[must_use]
+    pub const fn eager(self, robot: Mode) -> Self {
+        if matches!(robot, Mode::Armed) || robot.follows() { self.close() } else { self.open() }
     }
 
     /// Whether it is closed now and was moved since it stood at `before`.

@@ -1,7 +1,7 @@
 use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
-use teleop_common::authority::{Heard, Intent, Latch, Machine, MachineParams};
+use teleop_common::authority::{Clutch, Heard, Intent, Latch, Machine, MachineParams};
 use teleop_common::guard::{MotionGuard, TipGuard};
 use teleop_common::hand::{HandModel, JointVector, MAX_FINGERS};
 use teleop_common::mapping::{MappingOutput, MappingParams, ParamError, Retargeter};
@@ -106,6 +106,13 @@ pub struct PoseSample {
 }
 
 impl PoseSample {
+    /// A pose that is captured, sent and received at one moment: for virtual time.
+    #[must_use]
+    pub fn instant(at: MonoTime, sequence: u64, pose: MasterPose, clutch: Clutch) -> Self {
+        let intent = Intent { clutch, ..Intent::default() };
+        Self { pose, intent, epoch: 1, sequence, captured_remote: at, captured: at, sent: at, received: at }
+    }
+
     fn heard(&self) -> Heard {
         Heard {
             epoch: self.epoch,

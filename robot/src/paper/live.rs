@@ -1,5 +1,6 @@
 //! What the control loop makes of a motion: the live robot in virtual time, with a hand that does what it is told.
 
+use teleop_common::authority::{Clutch, Latch};
 use teleop_common::hand::{HandModel, JointVector};
 use teleop_common::mapping::{MappingParams, ParamError};
 use teleop_common::master::Gesture;
@@ -30,6 +31,7 @@ pub(super) fn commands(
     let (period, end) = (1.0 / control.rate, LEAD + gesture.duration() + TRAIL);
     let mut samples = Vec::new();
     let (mut tick, mut due) = (0_u32, 0_u32);
+    let mut clutch = Clutch::default();
     loop {
         let now = f64::from(tick) * period;
         if now > end + period {
@@ -38,17 +40,11 @@ pub(super) fn commands(
         // The newest pose of a source that sends at the rate of the samples.
         let sequence = (now * rate + 1e-9).floor();
         let sent = sequence / rate;
-        let at = MonoTime((sent * 1e9) as u64);
-        let sample = PoseSample {
-            pose: pose(gesture, (sent - LEAD).clamp(0.0, gesture.duration())),
-            epoch: 1,
-            sequence: sequence as u64,
-            captured_remote: at,
-            captured: at,
-            received: at,
-        };
+        clutch = clutch.eager(controller.mode());
+        let pose = pose(gesture, (sent - LEAD).clamp(0.0, gesture.duration()));
+        controller.admit(&PoseSample::instant(MonoTime((sent * 1e9) as u64), sequence as u64, pose, clutch));
         let before = state.q;
-        let record = controller.tick(MonoTime((now * 1e9) as u64), Some(&sample), &state);
+        let record = controller.tick(MonoTime((now * 1e9) as u64), Latch::default(), &state);
         (state.q, state.dq) = (record.command.q, record.command.dq);
         tick += 1;
         // The command of a tick is where the hand is at the next one.
