@@ -194,28 +194,29 @@ impl Pass<'_> {
         for &(angle, turn) in &nodes.list[..nodes.count] {
             // No posture there can be nearer to the reference than this joint alone.
             if 0.5 * self.weight * (angle - self.wish[1]).powi(2) >= self.cap {
-                valleys.push([Seed::NONE; 2]);
-                before = None;
+                if before.take().is_some() {
+                    valleys.push(&[Seed::NONE; 2]);
+                }
                 continue;
             }
             let seeds = self.at(angle, turn);
             if let Some(before) = before.filter(|_| self.ends) {
-                for (side, seed) in seeds.into_iter().enumerate() {
-                    let last = valleys.last[side];
+                for (side, seed) in seeds.iter().enumerate() {
+                    let last = &valleys.last[side];
                     if seed.reached != last.reached {
-                        let end = if seed.reached { (seed, turn, before) } else { (last, before, turn) };
+                        let end = if seed.reached { (*seed, turn, before) } else { (*last, before, turn) };
                         valleys.insert(self.end(side, end));
                     }
                 }
             }
-            valleys.push(seeds);
+            valleys.push(&seeds);
             before = Some(turn);
             // What costs more than the best of all, and could not be less between two nodes, is of no use.
             if valleys.found[0].reached {
                 self.cap = self.cap.min(valleys.found[0].cost + 2.0 * FLOOR_MARGIN * self.weight);
             }
         }
-        valleys.push([Seed::NONE; 2]);
+        valleys.push(&[Seed::NONE; 2]);
         valleys.found
     }
 
@@ -284,14 +285,15 @@ struct Valleys {
 }
 
 impl Valleys {
-    fn push(&mut self, seeds: [Seed; 2]) {
-        for (side, seed) in seeds.into_iter().enumerate() {
-            let falls = seed.cost < self.last[side].cost;
+    fn push(&mut self, seeds: &[Seed; 2]) {
+        for side in [0, 1] {
+            let falls = seeds[side].cost < self.last[side].cost;
             if self.falling[side] && !falls {
                 self.insert(self.last[side]);
             }
-            (self.last[side], self.falling[side]) = (seed, falls);
+            self.falling[side] = falls;
         }
+        self.last = *seeds;
     }
 
     fn insert(&mut self, mut entry: Seed) {
