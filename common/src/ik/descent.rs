@@ -230,58 +230,46 @@ fn box_step<const C: usize>(
     Some(step)
 }
 
-/// Minimiser over the joints that are not active, the others being as in `step`: Cholesky, row by row.
+/// Minimiser over the joints that are not active, the others being as in `step`: L D L^T, row by row. Active joints get
+/// rows of the identity instead of branches, which leaves loops of known length.
 fn solve_free<const C: usize>(
     hessian: &Square<C>,
     gradient: &Row<C>,
     step: &Row<C>,
     active: &[bool; C],
 ) -> Option<Row<C>> {
-    let mut factor = [[0.0; C]; C];
-    let mut out = *step;
+    // The factor L, and L D.
+    let (mut factor, mut scaled) = ([[0.0; C]; C], [[0.0; C]; C]);
+    let (mut inverse, mut out) = ([0.0; C], *step);
     for row in 0..C {
-        if active[row] {
-            continue;
-        }
-        let mut right = -gradient[row];
-        for other in 0..C {
-            if active[other] {
+        if !active[row] {
+            out[row] = -gradient[row];
+            for other in 0..C {
                 let value = if row >= other { hessian[row][other] } else { hessian[other][row] };
-                right -= value * step[other];
+                out[row] -= if active[other] { value * step[other] } else { 0.0 };
             }
         }
+        let mut pivot = if active[row] { 1.0 } else { hessian[row][row] };
+        let least = 1e-13 * pivot.abs();
         for column in 0..row {
-            if active[column] {
-                continue;
-            }
-            let mut sum = hessian[row][column];
+            let mut sum = if active[row] || active[column] { 0.0 } else { hessian[row][column] };
             for inner in 0..column {
-                sum -= factor[row][inner] * factor[column][inner];
+                sum -= scaled[row][inner] * factor[column][inner];
             }
-            factor[row][column] = sum * factor[column][column];
-            right -= factor[row][column] * out[column];
+            (scaled[row][column], factor[row][column]) = (sum, sum * inverse[column]);
+            pivot -= sum * factor[row][column];
+            out[row] -= factor[row][column] * out[column];
         }
-        let mut pivot = hessian[row][row];
-        for inner in 0..row {
-            pivot -= factor[row][inner] * factor[row][inner];
-        }
-        if pivot <= 1e-13 * hessian[row][row].abs() {
+        if pivot <= least {
             return None;
         }
-        // The diagonal holds its reciprocal.
-        factor[row][row] = 1.0 / pivot.sqrt();
-        out[row] = right * factor[row][row];
+        inverse[row] = 1.0 / pivot;
     }
     for row in (0..C).rev() {
-        if active[row] {
-            continue;
-        }
+        out[row] *= inverse[row];
         for below in row + 1..C {
-            if !active[below] {
-                out[row] -= factor[below][row] * out[below];
-            }
+            out[row] -= factor[below][row] * out[below];
         }
-        out[row] *= factor[row][row];
     }
     Some(out)
 }

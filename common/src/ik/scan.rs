@@ -189,37 +189,40 @@ struct Pass<'a> {
 impl Pass<'_> {
     fn valleys(&mut self, nodes: &Nodes<'_>) -> [Seed; SEEDS] {
         let mut valleys = Valleys { found: [Seed::NONE; SEEDS], last: [Seed::NONE; 2], falling: [true; 2] };
-        let mut last: Option<(Plane, [Seed; 2])> = None;
+        // Where the sweep was before, unless nothing there was worth a look.
+        let mut before: Option<Plane> = None;
         for &(angle, turn) in &nodes.list[..nodes.count] {
             // No posture there can be nearer to the reference than this joint alone.
             if 0.5 * self.weight * (angle - self.wish[1]).powi(2) >= self.cap {
-                valleys.push([Seed::NONE; 2]);
-                last = None;
+                if before.take().is_some() {
+                    valleys.push(&[Seed::NONE; 2]);
+                }
                 continue;
             }
             let seeds = self.at(angle, turn);
-            if let Some(last) = last.filter(|_| self.ends) {
-                for side in [0, 1] {
-                    if seeds[side].reached != last.1[side].reached {
-                        let ends = if seeds[side].reached { [(turn, seeds), last] } else { [last, (turn, seeds)] };
-                        valleys.insert(self.end(side, ends));
+            if let Some(before) = before.filter(|_| self.ends) {
+                for (side, seed) in seeds.iter().enumerate() {
+                    let last = &valleys.last[side];
+                    if seed.reached != last.reached {
+                        let end = if seed.reached { (*seed, turn, before) } else { (*last, before, turn) };
+                        valleys.insert(self.end(side, end));
                     }
                 }
             }
-            valleys.push(seeds);
-            last = Some((turn, seeds));
+            valleys.push(&seeds);
+            before = Some(turn);
             // What costs more than the best of all, and could not be less between two nodes, is of no use.
             if valleys.found[0].reached {
                 self.cap = self.cap.min(valleys.found[0].cost + 2.0 * FLOOR_MARGIN * self.weight);
             }
         }
-        valleys.push([Seed::NONE; 2]);
+        valleys.push(&[Seed::NONE; 2]);
         valleys.found
     }
 
-    /// The end of a valley between a posture that reaches and one that does not: it may be lowest there.
-    fn end(&self, side: usize, [(mut inside, seeds), (mut outside, _)]: [(Plane, [Seed; 2]); 2]) -> Seed {
-        let mut seed = seeds[side];
+    /// The end of a valley between a posture that reaches, with the held joint at `inside`, and one that does not: it may
+    /// be lowest there.
+    fn end(&self, side: usize, (mut seed, mut inside, mut outside): (Seed, Plane, Plane)) -> Seed {
         let reach = (2.0 * seed.cost).sqrt() - NODE_MARGIN * self.weight.sqrt();
         if reach > 0.0 && 0.5 * reach * reach >= self.cap {
             return Seed::NONE;
@@ -282,14 +285,15 @@ struct Valleys {
 }
 
 impl Valleys {
-    fn push(&mut self, seeds: [Seed; 2]) {
-        for (side, seed) in seeds.into_iter().enumerate() {
-            let falls = seed.cost < self.last[side].cost;
+    fn push(&mut self, seeds: &[Seed; 2]) {
+        for side in [0, 1] {
+            let falls = seeds[side].cost < self.last[side].cost;
             if self.falling[side] && !falls {
                 self.insert(self.last[side]);
             }
-            (self.last[side], self.falling[side]) = (seed, falls);
+            self.falling[side] = falls;
         }
+        self.last = *seeds;
     }
 
     fn insert(&mut self, mut entry: Seed) {

@@ -204,7 +204,9 @@ impl<const C: usize> Shape<C> {
             let step = factor.solve(&gradient);
             let step = step * (MAX_STEP / step.amax().max(MAX_STEP));
             let next = (q - step).zip_zip_map(&self.lower, &self.upper, |q, lower, upper| q.max(lower).min(upper));
-            let moved = (next - q).amax();
+            if (next - q).amax() < SETTLED {
+                return (value, next);
+            }
             let (next_bones, next_slopes) = bones(chain, &next);
             let next_value = self.cost(wanted, &next_bones, &next);
             if next_value < value {
@@ -212,9 +214,6 @@ impl<const C: usize> Shape<C> {
                 damping *= 0.2;
             } else {
                 damping = (damping * 5.0).max(1e-2);
-            }
-            if moved < SETTLED {
-                break;
             }
         }
         (value, q)

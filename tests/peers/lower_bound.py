@@ -1,0 +1,165 @@
+"""What no retargeter can do on a recording, however clever it is and even if it knows the future: linear programs.
+
+A hand cannot both copy a fast, noisy human and move smoothly. This asks how much of each is possible at all, over *all*
+joint paths x of a recording's frames, and prints two Markdown tables.
+
+1. Smoothness. The least mean |x[t+1] - 2 x[t] + x[t-1]| of a path that stays within eps of the given one, joint by
+   joint and frame by frame.
+2. Contact within the limits. The least eps with which a path exists that obeys the hand's speed and acceleration, stays
+   within eps of the combined mapping's in every frame, and in the frames in which the human pinches is exactly on it
+   with the joints of thumb and pinching finger, which is where the tips touch.
+
+Lag is allowed as stated: with a lag of up to one frame, x[t] need only be within eps of the interval between the path's
+x[t-1] and x[t], which every constant or changing delay of up to a frame fulfils. Speed and acceleration bound the path
+between frames too; only what they imply for the frames themselves is asked for, |x[t+1] - x[t]| <= v dt and
+|x[t+1] - 2 x[t] + x[t-1]| <= a dt^2. Both make the bounds lower, so that they hold for every retargeter.
+
+Proved is: no path that is that faithful in joint space is smoother, or closes that contact. Not proved is anything about
+paths that are faithful in another sense. A finger of four joints can touch the thumb in other postures than the combined
+mapping's, and the gap is not linear in the joint angles, so another pinch posture nearer to where the finger comes from
+is not excluded by table 2. The joint limits are left out, which makes the bounds lower again.
+"""
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+import tomllib
+from pathlib import Path
+
+import numpy as np
+from scipy.optimize import linprog
+from scipy.sparse import csr_array, eye_array, hstack, vstack
+
+URDF = Path(__file__).resolve().parents[2] / "urdf"
+TOLERANCES = (0.05, 0.1, 0.2)  # rad
+SPEED, ACCELERATION = 7.0, 300.0  # of the Allegro's joints, rad/s and rad/s^2
+TIPS = {"thumb": 4, "index": 8, "middle": 12, "ring": 16}  # of the 21 keypoints
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--recording", type=Path, required=True)
+    parser.add_argument("--hand", choices=("right", "left"), required=True)
+    parser.add_argument("--robot", type=Path, required=True)
+    parser.add_argument("--pinch", type=float, required=True, help="mm")
+    parser.add_argument("robot_options", nargs="*")
+    arguments = parser.parse_args()
+    table = np.loadtxt(arguments.recording, delimiter=",", skiprows=1)
+    dt = float(np.median(np.diff(table[:, 1])))
+    pinched = pinches(table[:, 2:].reshape(-1, 21, 3), 1e-3 * arguments.pinch, arguments.hand)
+    measured = retarget(arguments, "--mode", "joint", "--filter", "off")
+    combined = retarget(arguments)
+    if not len(measured) == len(combined) == len(table):
+        sys.exit(f"error: {arguments.robot} gives {len(combined)} frames for {len(table)}")
+
+    print(f"`{arguments.recording.name}`, {len(table)} frames at {1 / dt:.3g} Hz. Least mean second difference, mrad:\n")
+    row("within eps of", "lag, frames", "eps 0 (the path)", *(f"eps {eps} rad" for eps in TOLERANCES))
+    row(*["---"] * (3 + len(TOLERANCES)))
+    for name, path in (("joint mapping, unfiltered", measured), ("combined mapping", combined)):
+        for lag in (0, 1):
+            own = [f"{1e3 * np.abs(np.diff(path, n=2, axis=0)).mean():.1f}"] if lag == 0 else [""]
+            row(name, lag, *own, *(f"{1e3 * smoothest(path, eps, lag):.1f}" for eps in TOLERANCES))
+
+    frames = int(pinched.any(axis=1).sum())
+    print(f"\nLeast eps within {SPEED:g} rad/s and {ACCELERATION:g} rad/s^2, rad; the human pinches in {frames} frames:\n")
+    row("within eps of the combined mapping, lag, frames", "in no frame exact", "exact in the pinches")
+    row(*["---"] * 3)
+    for lag in (0, 1):
+        found = [nearest(combined, exact, dt, lag) for exact in (np.zeros_like(pinched), pinched)]
+        row(lag, *("impossible" if error is None else f"{error:.2f}" for error in found))
+
+
+def row(*cells) -> None:
+    print(f"| {' | '.join(map(str, cells))} |")
+
+
+def retarget(arguments: argparse.Namespace, *more: str) -> np.ndarray:
+    """Joint angles (frames, joints), rad, by `robot retarget`."""
+    with tempfile.TemporaryDirectory() as folder:
+        output = Path(folder) / "frames.jsonl"
+        command = [arguments.robot, "retarget", "--hand", arguments.hand, "--input", arguments.recording]
+        command += ["--output", output, *more, *arguments.robot_options]
+        done = subprocess.run(command, capture_output=True, text=True)
+        if done.returncode != 0:
+            sys.exit(f"error: {' '.join(map(str, command))}\n{done.stderr.strip()}")
+        return np.array([json.loads(line)["q"] for line in output.read_text().splitlines()])
+
+
+def pinches(human: np.ndarray, threshold: float, side: str) -> np.ndarray:
+    """Whether a joint takes part in a pinch, (frames, joints), of keypoints (frames, 21, 3), m."""
+    description = tomllib.loads((URDF / f"allegro_v4_{side}.toml").read_text())
+    order = description["joints"]["order"]
+    of = {finger["name"]: [order.index(joint) for joint in finger["joints"]] for finger in description["finger"]}
+    out = np.zeros((len(human), len(order)), dtype=bool)
+    for finger in ("index", "middle", "ring"):
+        close = np.linalg.norm(human[:, TIPS[finger]] - human[:, TIPS["thumb"]], axis=1) < threshold
+        out[np.ix_(close, of["thumb"] + of[finger])] = True
+    return out
+
+
+def band(path: np.ndarray, lag: int) -> tuple[np.ndarray, np.ndarray]:
+    """Least and largest value of one joint's path (frames,) from each frame back to `lag` frames before."""
+    before = [np.concatenate([np.full(shift, path[0]), path[: len(path) - shift]]) for shift in range(lag + 1)]
+    return np.min(before, axis=0), np.max(before, axis=0)
+
+
+def difference(frames: int, order: int) -> csr_array:
+    """The matrix of the first or second difference."""
+    rows = frames - order
+    weights = {1: (-1.0, 1.0), 2: (1.0, -2.0, 1.0)}[order]
+    return csr_array(sum(weight * eye_array(rows, frames, k=shift) for shift, weight in enumerate(weights)))
+
+
+def smoothest(path: np.ndarray, eps: float, lag: int) -> float:
+    """The least mean second difference within `eps` of `path` (frames, joints), rad."""
+    frames, joints = path.shape
+    second = difference(frames, 2)
+    count = second.shape[0]
+    # Minimise sum(s) with -s <= D x <= s.
+    bounding = vstack([hstack([second, -eye_array(count)]), hstack([-second, -eye_array(count)])])
+    cost = np.concatenate([np.zeros(frames), np.ones(count)])
+    total = 0.0
+    for joint in range(joints):
+        low, high = band(path[:, joint], lag)
+        ranges = np.concatenate([np.column_stack([low - eps, high + eps]), np.tile([0.0, np.inf], (count, 1))])
+        total += solve(cost, bounding, np.zeros(2 * count), ranges).fun
+    return total / (count * joints)
+
+
+def nearest(path: np.ndarray, exact: np.ndarray, dt: float, lag: int) -> float | None:
+    """The least error, rad, of a path within the hand's limits that is exactly on `path` where `exact` (both (frames,
+    joints)); None if there is no such path at all."""
+    frames, joints = path.shape
+    first, second = difference(frames, 1), difference(frames, 2)
+    limits = [(first, SPEED * dt), (-first, SPEED * dt), (second, ACCELERATION * dt**2), (-second, ACCELERATION * dt**2)]
+    worst = 0.0
+    for joint in range(joints):
+        low, high = band(path[:, joint], lag)
+        own = exact[:, joint]
+        # Minimise e with low - e <= x <= high + e, and x on the path where it is to be exact, whatever the lag.
+        loose = csr_array(np.ones((frames, 1)))
+        sides = [hstack([eye_array(frames), -loose]), hstack([-eye_array(frames), -loose])]
+        matrix = vstack([hstack([part, csr_array((part.shape[0], 1))]) for part, _ in limits] + sides)
+        right = np.concatenate([np.full(part.shape[0], limit) for part, limit in limits] + [high, -low])
+        bounds = [np.append(np.where(own, path[:, joint], free), end) for free, end in ((-np.inf, 0.0), (np.inf, np.inf))]
+        found = solve(np.append(np.zeros(frames), 1.0), matrix, right, np.column_stack(bounds))
+        if found is None:
+            return None
+        worst = max(worst, found.fun)
+    return worst
+
+
+def solve(cost: np.ndarray, matrix: csr_array, right: np.ndarray, bounds: np.ndarray):
+    """The solution of min cost x, matrix x <= right; None if nothing fulfils that."""
+    found = linprog(cost, A_ub=csr_array(matrix), b_ub=right, bounds=bounds, method="highs")
+    if found.status == 2:
+        return None
+    if found.status != 0:
+        sys.exit(f"error: HiGHS: {found.message}")
+    return found
+
+
+if __name__ == "__main__":
+    main()
