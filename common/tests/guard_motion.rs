@@ -20,12 +20,15 @@ use teleop_common::testing::shared_data;
 const PERIOD: f64 = 1.0 / 333.0;
 const ALLOWANCE: f64 = 0.0005;
 
+/// Axis and radius of a capsule, m.
+type Placed = ([Vector3<f64>; 2], f64);
+
 /// Gaps by another way than the guard's: poses of all links from their transforms, distances by a search.
 struct Referee {
     hand: HandModel,
     poses: Vec<Isometry3<f64>>,
-    // Axis and radius by finger, body, capsule.
-    placed: Vec<Vec<Vec<([Vector3<f64>; 2], f64)>>>,
+    // By finger, body, capsule.
+    placed: Vec<Vec<Vec<Placed>>>,
 }
 
 impl Referee {
