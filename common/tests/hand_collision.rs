@@ -98,7 +98,8 @@ fn what_is_not_kept_apart_is_in_the_description() {
         let mut listed: Vec<&str> = listed.split(", ").collect();
         assert!(collision.ignored.iter().all(|[_, palm]| palm == "palm_link"), "{:?}", collision.ignored);
         let mut ignored: Vec<&str> = collision.ignored.iter().map(|[link, _]| link.as_str()).collect();
-        (listed.sort_unstable(), ignored.sort_unstable());
+        listed.sort_unstable();
+        ignored.sort_unstable();
         assert_eq!(listed, ignored);
         // Of five bodies of four fingers each.
         assert_eq!((collision.pairs.len(), collision.palm_pairs.len()), (6 * 25, 4 * 3));

@@ -24,8 +24,8 @@ use crate::hand::{
 
 /// No command brings two bodies further into each other, m. Two fingertips: or [`TIP_SLACK`] more than they may.
 pub const MAX_PENETRATION: f64 = 0.001;
-/// A hand that starts with bodies this far inside each other (m) is on its own with them until they are apart: nothing
-/// says which way is out.
+/// Bodies that start further inside each other than that by this (m) are left alone until they are not: nothing says
+/// which way is out.
 const LOST: f64 = 0.005;
 /// What rounding may take of the penetration, m.
 const ROUNDING: f64 = 1e-6;
@@ -161,20 +161,20 @@ impl MotionGuard {
         Self { pairs: fingers.chain(palm).collect(), sizes, levers }
     }
 
-    /// How far any two bodies that are kept apart are inside each other at `q` (rad, wire order), m; negative if all are
-    /// apart. Fingertips count by what they overlap beyond what they may.
+    /// The least gap of any two bodies that are kept apart, at `q` (rad, wire order), m; negative if they overlap.
     #[must_use]
-    pub fn deepest(&self, hand: &HandModel, q: &JointVector) -> f64 {
+    pub fn least_gap(&self, hand: &HandModel, q: &JointVector) -> f64 {
         let world = World::new(hand, q);
-        self.pairs.iter().map(|pair| -pair.hold - world.gap(hand, pair)).fold(f64::NEG_INFINITY, f64::max)
+        self.pairs.iter().map(|pair| world.gap(hand, pair)).fold(f64::INFINITY, f64::min)
     }
 
     /// Changes `velocity` (rad/s, wire order), about to be commanded at posture `q` (rad) for `period` seconds, so that
     /// nothing collides.
     ///
     /// Each joint stays between `low` and `high` (rad/s), which is what it can do in this tick and contains the hardest
-    /// braking. `movable` says which of the hand's fingers give way; the others do if that is not enough. Does not
-    /// allocate; bounded work.
+    /// braking. `movable` says which of the hand's fingers give way; the others do if that is not enough. The proof holds
+    /// if the hand starts at rest and in every tick either passes through here or brakes as hard as it can, as
+    /// [`Conditioner`](crate::conditioner::Conditioner) does in a hold. Does not allocate; bounded work.
     pub fn guard(
         &self,
         hand: &HandModel,
@@ -200,7 +200,7 @@ impl MotionGuard {
                 continue;
             }
             let gap = world.gap(hand, pair);
-            if gap + pair.hold >= reach || gap < -LOST {
+            if gap + pair.hold >= reach || gap < -pair.stop - LOST {
                 continue;
             }
             complete &= near.push(Near { pair: index as u16, gap, least: gap.min(ROUNDING - pair.stop) });

@@ -70,72 +70,41 @@ impl Collision {
         joints: &[Joint],
     ) -> Result<Self, HandError> {
         let mut out = Self { fingers: vec![Vec::new(); fingers.len()], ..Self::default() };
-        // Of every link the pose in the last moving link before it, and that link.
-        let mut carriers: Vec<(Option<BodyIndex>, Isometry3<f64>)> = Vec::with_capacity(tree.links.len());
-        let mut shapes: Vec<Vec<(usize, String, Vec<Capsule>)>> = vec![Vec::new(); fingers.len()];
-        let mut any = false;
-        for link in &tree.links {
-            let carrier = link.parent.as_ref().map_or((None, Isometry3::identity()), |(parent, joint)| {
-                let (carrier, pose) = carriers[*parent];
-                let moved = joint.motion.and_then(|_| {
-                    let wire = joints.iter().position(|other| other.name == joint.name)?;
-                    fingers.iter().enumerate().find_map(|(finger, chain)| {
-                        chain.joints.iter().position(|own| own.joint == wire).map(|slot| (finger, slot))
-                    })
-                });
-                moved.map_or((carrier, pose * joint.origin), |moved| (Some(moved), Isometry3::identity()))
-            });
-            carriers.push(carrier);
-            let (carrier, pose) = carrier;
-            any |= !link.solids.is_empty();
+        if tree.links.iter().all(|link| link.solids.is_empty()) {
+            tree.warnings.push("no collision shapes: only the fingertips are kept apart".to_owned());
+        }
+        for (link, (carrier, pose)) in tree.links.iter().zip(carriers(tree, fingers, joints)) {
             let Some((finger, slot)) = carrier else {
                 out.palm.extend(link.solids.iter().map(|solid| solid.rounded(&pose)));
                 continue;
             };
-            let chain = &fingers[finger];
-            let own = &mut shapes[finger];
-            let last = slot + 1 == chain.joints.len();
-            for solid in &link.solids {
-                let mut capsules = solid.capsules(&pose);
-                // The tip's sphere is there anyway.
-                capsules
-                    .retain(|capsule| !(last && capsule.is_sphere(&chain.center, (chain.pole - chain.center).norm())));
-                if capsules.is_empty() {
-                    continue;
-                }
-                match own.iter_mut().find(|(other, ..)| *other == slot) {
-                    Some((.., list)) => list.extend(capsules),
-                    None => own.push((slot, link.name.clone(), capsules)),
-                }
+            let (chain, bodies) = (&fingers[finger], &mut out.fingers[finger]);
+            let mut capsules: Vec<Capsule> = link.solids.iter().flat_map(|solid| solid.capsules(&pose)).collect();
+            // The tip's sphere comes below.
+            capsules.retain(|capsule| slot + 1 < chain.joints.len() || !capsule.is(&tip(chain)));
+            match bodies.iter_mut().find(|body| body.slot == slot) {
+                _ if capsules.is_empty() => {}
+                Some(body) => body.capsules.extend(capsules),
+                None => bodies.push(Body { link: link.name.clone(), slot, bound: capsules[0], capsules, tip: false }),
             }
-        }
-        if !any {
-            tree.warnings.push("no collision shapes: only the fingertips are kept apart".to_owned());
         }
         if out.palm.len() > MAX_SHAPES {
             let problem = format!("{} collision shapes are more than the {MAX_SHAPES} allowed", out.palm.len());
             return Err(HandError::urdf("palm", problem));
         }
-        for ((finger, chain), center) in fingers.iter().enumerate().zip(centers) {
-            for (slot, link, capsules) in std::mem::take(&mut shapes[finger]) {
-                if capsules.len() > MAX_SHAPES {
-                    let count = capsules.len();
+        for ((bodies, chain), center) in out.fingers.iter_mut().zip(fingers).zip(centers) {
+            for body in bodies.iter_mut() {
+                let count = body.capsules.len();
+                if count > MAX_SHAPES {
                     let problem = format!(
                         "its collision shapes make {count} capsules, more than the {MAX_SHAPES} allowed; use fewer boxes"
                     );
-                    return Err(HandError::urdf(format!("link '{link}'"), problem));
+                    return Err(HandError::urdf(format!("link '{}'", body.link), problem));
                 }
-                out.fingers[finger].push(Body { link, slot, bound: around(&capsules), capsules, tip: false });
+                body.bound = around(&body.capsules);
             }
-            let tip = Capsule { ends: [chain.center; 2], radius: (chain.pole - chain.center).norm() };
-            let slot = chain.joints.len() - 1;
-            out.fingers[finger].push(Body {
-                link: (*center).to_owned(),
-                slot,
-                capsules: vec![tip],
-                bound: tip,
-                tip: true,
-            });
+            let (slot, tip) = (chain.joints.len() - 1, tip(chain));
+            bodies.push(Body { link: (*center).to_owned(), slot, capsules: vec![tip], bound: tip, tip: true });
         }
         out.choose(fingers, joints, &tree.links[0].name);
         Ok(out)
@@ -183,9 +152,34 @@ impl Collision {
     }
 }
 
+/// Of every link the joint that carries it (finger and place in it; none for what is fixed to the palm), and its pose in
+/// that joint's frame.
+fn carriers(tree: &Tree, fingers: &[FingerChain], joints: &[Joint]) -> Vec<(Option<BodyIndex>, Isometry3<f64>)> {
+    let mut out: Vec<(Option<BodyIndex>, Isometry3<f64>)> = Vec::with_capacity(tree.links.len());
+    for link in &tree.links {
+        let own = link.parent.as_ref().map(|(parent, joint)| {
+            let wire = joints.iter().position(|other| other.name == joint.name);
+            let mover = fingers.iter().enumerate().find_map(|(finger, chain)| {
+                chain.joints.iter().position(|own| Some(own.joint) == wire).map(|slot| (finger, slot))
+            });
+            // Parents come before their children.
+            let (carrier, pose) = out[*parent];
+            if mover.is_some() { (mover, Isometry3::identity()) } else { (carrier, pose * joint.origin) }
+        });
+        out.push(own.unwrap_or_else(|| (None, Isometry3::identity())));
+    }
+    out
+}
+
+fn tip(chain: &FingerChain) -> Capsule {
+    Capsule { ends: [chain.center; 2], radius: (chain.pole - chain.center).norm() }
+}
+
 impl Capsule {
-    fn is_sphere(&self, center: &Vector3<f64>, radius: f64) -> bool {
-        self.ends.iter().all(|end| (end - center).norm() < 1e-6) && (self.radius - radius).abs() < 1e-6
+    /// True if it is the same but for rounding.
+    fn is(&self, other: &Self) -> bool {
+        let off = self.ends.iter().zip(&other.ends).map(|(a, b)| (a - b).norm()).fold(0.0, f64::max);
+        off.max((self.radius - other.radius).abs()) < 1e-6
     }
 }
 
