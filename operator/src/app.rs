@@ -8,15 +8,15 @@ use anyhow::{Context as _, anyhow};
 use teleop_common::key::Keys;
 use teleop_common::master::Gesture;
 use teleop_common::net::clock::random_epoch;
-use teleop_common::net::keyboard;
+use teleop_common::net::{Session, SessionConfig, keyboard};
 
 use crate::calibrate;
 use crate::cli::{Cli, Command, ListArgs, LogArgs, StopArgs, WatchArgs};
-use crate::failure::{Failure, OrFail as _, open_session};
+use crate::failure::{Failure, OrFail as _, not_open};
 use crate::feedback::Feedback;
 use crate::list::list;
-use crate::listen::Listener;
 use crate::request::{Requester, Wish};
+use crate::robot_link::RobotLink;
 use crate::run::run;
 use crate::shutdown::Shutdown;
 use crate::terminal::{Terminal, say};
@@ -121,11 +121,10 @@ fn gestures() {
 
 fn stop_robot(args: &StopArgs) -> Result<(), Failure> {
     let keys = Keys::new(&args.robot.name).or_usage()?;
-    let session = open_session(&args.robot.connect, &[])?;
     let epoch = random_epoch();
     let feedback = Arc::new(Feedback::new(epoch));
-    let _listener = Listener::start(&session, &keys, &feedback).or_runtime()?;
-    let mut requester = Requester::new(&session, &keys, epoch, &feedback).or_runtime()?;
+    let link = RobotLink::open(args.robot.session(), &keys, None, &feedback).map_err(not_open)?;
+    let mut requester = Requester::new(link.sender(), epoch, &feedback);
     if requester.ask(Wish::Stop, &AtomicBool::new(false)).or_runtime()? {
         say(&format!("robot {} is stopped, until the stop is reset", keys.name())).ok();
         return Ok(());
@@ -135,16 +134,16 @@ fn stop_robot(args: &StopArgs) -> Result<(), Failure> {
 }
 
 fn list_robots(args: &ListArgs, shutdown: &Shutdown) -> Result<(), Failure> {
-    let session = open_session(&args.connect, &[])?;
+    let config = SessionConfig::connecting(args.connect.iter().cloned());
+    let session = Session::open(&config).map_err(not_open)?;
     list(&session, Duration::from_secs_f64(args.time), args.json, shutdown).or_runtime()?;
     Ok(())
 }
 
 fn watch_robot(args: &WatchArgs, shutdown: &Shutdown) -> Result<(), Failure> {
     let keys = Keys::new(&args.robot.name).or_usage()?;
-    let session = open_session(&args.robot.connect, &[])?;
     let feedback = Arc::new(Feedback::new(random_epoch()));
-    let _listener = Listener::start(&session, &keys, &feedback).or_runtime()?;
+    let _link = RobotLink::open(args.robot.session(), &keys, None, &feedback).map_err(not_open)?;
     let options = WatchOptions {
         json: args.json,
         duration: args.duration.map(Duration::from_secs_f64),

@@ -9,7 +9,7 @@ use teleop_common::master::{Calibration, Calibrator, SideVerdict};
 use teleop_common::recording::FrameData;
 
 use crate::cli::CalibrateArgs;
-use crate::failure::{Failure, OrFail as _, open_session};
+use crate::failure::{Failure, OrFail as _, listening_session};
 use crate::shutdown::Shutdown;
 use crate::source::{Poll, RecordingFile, Source, SourceSpec, ZenohSource};
 use crate::terminal::say;
@@ -66,7 +66,7 @@ pub(crate) fn load(path: &Path) -> anyhow::Result<Calibration> {
 
 fn live(args: &CalibrateArgs, shutdown: &Shutdown) -> Result<Calibrator, Failure> {
     let keys = Keys::new(&args.name).or_usage()?;
-    let session = open_session(&[], &args.listen)?;
+    let session = listening_session(&args.listen)?;
     let mut source = Source::Zenoh(ZenohSource::subscribe(&session, &keys).or_runtime()?);
     let time = args.seconds.map_or(LIVE, Duration::from_secs_f64);
     say(&format!("waiting for keypoints on {} at {}", keys.hand_input(), args.listen.join(", "))).ok();

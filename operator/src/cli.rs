@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
+use teleop_common::net::SessionConfig;
 use teleop_common::viz::Viewer;
 
 use crate::pilot::ClutchBy;
@@ -78,6 +79,13 @@ pub struct RobotArgs {
     /// Where the robot listens; repeatable
     #[arg(long, default_value = ROBOT_ENDPOINT, value_name = "ENDPOINT")]
     pub connect: Vec<String>,
+}
+
+impl RobotArgs {
+    /// The session with the robot.
+    pub(crate) fn session(&self) -> SessionConfig {
+        SessionConfig::connecting(self.connect.iter().cloned())
+    }
 }
 
 /// How much to tell.

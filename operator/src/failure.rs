@@ -48,13 +48,17 @@ impl<T, E: Into<anyhow::Error>> OrFail<T> for Result<T, E> {
     }
 }
 
-/// Opens a session; a bad endpoint is wrong usage, a taken port is not.
-pub(crate) fn open_session(connect: &[String], listen: &[String]) -> Result<Session, Failure> {
-    let config = SessionConfig { connect: connect.to_vec(), listen: listen.to_vec(), ..SessionConfig::default() };
-    Session::open(&config).map_err(|error| match error {
+/// The failure of a session that does not open: a bad endpoint is wrong usage, a taken port is not.
+pub(crate) fn not_open(error: NetError) -> Failure {
+    match error {
         NetError::Endpoint { .. } | NetError::Setting { .. } | NetError::ConfigFile { .. } => {
             Failure::Usage(error.into())
         }
         error => Failure::Runtime(error.into()),
-    })
+    }
+}
+
+/// Opens a session that only listens.
+pub(crate) fn listening_session(listen: &[String]) -> Result<Session, Failure> {
+    Session::open(&SessionConfig { listen: listen.to_vec(), ..SessionConfig::default() }).map_err(not_open)
 }

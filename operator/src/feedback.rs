@@ -221,15 +221,16 @@ impl Feedback {
         })
     }
 
-    /// Whether something that the robot publishes all the time, once it follows poses, has not come for a while.
+    /// When the robot's joint states came last, and when all that it publishes did; `None`: never.
     #[must_use]
-    pub fn is_deaf(&self, now: MonoTime) -> bool {
+    pub fn last_heard(&self) -> (Option<MonoTime>, Option<MonoTime>) {
         let state = self.lock();
-        let missing = |at: Option<MonoTime>| at.is_none_or(|at| now.since(at) >= SILENCE);
-        let follows = state.joints.as_ref().is_some_and(|heard| heard.message.pose_seq > 0);
-        missing(state.joints.as_ref().map(|heard| heard.at))
-            || missing(state.health.as_ref().map(|heard| heard.at))
-            || follows && missing(state.mapping.as_ref().map(|heard| heard.at))
+        let Some(joints) = &state.joints else { return (None, None) };
+        let health = state.health.as_ref().map(|heard| heard.at);
+        // Signals of the mapping are there once poses have come.
+        let mapping =
+            if joints.message.pose_seq > 0 { state.mapping.as_ref().map(|heard| heard.at) } else { Some(joints.at) };
+        (Some(joints.at), health.zip(mapping).map(|(health, mapping)| health.min(mapping).min(joints.at)))
     }
 
     /// All round trips so far.

@@ -8,7 +8,7 @@
 //! | [`pipeline`] | the source thread: frames in, poses out |
 //! | [`stream`] | the publisher thread behind a latest-value slot |
 //! | [`feedback`] | the robot as last heard, round trip, clock offset |
-//! | [`listen`] | subscriptions to the robot, declared anew where nothing comes |
+//! | [`robot_link`] | the session with the robot, opened anew when it falls silent |
 //! | [`pilot`] | the clutch: when the robot may follow |
 //! | [`request`] | stops and resets |
 //! | [`terminal`] | the status line |
@@ -26,12 +26,12 @@ pub mod failure;
 pub mod feedback;
 pub mod hand;
 pub mod list;
-pub mod listen;
 pub mod pilot;
 pub mod pipeline;
 pub mod record;
 pub mod request;
 pub mod robot_hand;
+pub mod robot_link;
 pub mod run;
 pub mod shutdown;
 pub mod source;

@@ -11,7 +11,7 @@ use teleop_common::net::clock::now;
 use teleop_common::net::{NetError, Session};
 
 use crate::feedback::Feedback;
-use crate::listen::Listener;
+use crate::robot_link::hear;
 use crate::shutdown::Shutdown;
 use crate::terminal::say;
 
@@ -44,8 +44,8 @@ pub fn list(session: &Session, time: Duration, json: bool, shutdown: &Shutdown) 
         {
             // It only listens, so its epoch is nobody's.
             let feedback = Arc::new(Feedback::new(0));
-            let listener = Listener::start(session, &keys, &feedback)?;
-            robots.insert(keys.name().to_owned(), (feedback, listener));
+            let subscribers = hear(session, &keys, &feedback)?;
+            robots.insert(keys.name().to_owned(), (feedback, subscribers));
         }
     }
     if !robots.is_empty() {

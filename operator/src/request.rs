@@ -6,13 +6,13 @@ use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
-use teleop_common::key::Keys;
 use teleop_common::mode::Mode;
+use teleop_common::net::NetError;
 use teleop_common::net::clock::now;
-use teleop_common::net::{NetError, Publisher, Session, Stream};
 use teleop_common::wire::{ControlMessage, Request, Stamper};
 
 use crate::feedback::Feedback;
+use crate::robot_link::RobotSender;
 
 /// How often a request is repeated, ...
 const EVERY: Duration = Duration::from_millis(50);
@@ -30,19 +30,16 @@ pub enum Wish {
 
 /// Sends requests to one robot.
 pub struct Requester {
-    publisher: Publisher,
+    sender: RobotSender,
     stamper: Stamper,
     feedback: Arc<Feedback>,
 }
 
 impl Requester {
-    /// Requests by the process `epoch` to the robot whose keys these are.
-    ///
-    /// # Errors
-    /// The session is closed.
-    pub fn new(session: &Session, keys: &Keys, epoch: u64, feedback: &Arc<Feedback>) -> Result<Self, NetError> {
-        let publisher = session.publisher(&keys.control(), Stream::Slow)?;
-        Ok(Self { publisher, stamper: Stamper::new(epoch), feedback: Arc::clone(feedback) })
+    /// Requests by the process `epoch`.
+    #[must_use]
+    pub fn new(sender: RobotSender, epoch: u64, feedback: &Arc<Feedback>) -> Self {
+        Self { sender, stamper: Stamper::new(epoch), feedback: Arc::clone(feedback) }
     }
 
     /// Asks until it is done; false if the robot does not show that within 3 s, or `stop` is set before.
@@ -62,7 +59,7 @@ impl Requester {
             };
             if let Some((robot, request)) = request {
                 let header = self.stamper.header::<ControlMessage>(now());
-                self.publisher.send(&ControlMessage::new(header, robot, request))?;
+                self.sender.control(&ControlMessage::new(header, robot, request))?;
             }
             std::thread::sleep(EVERY);
         }

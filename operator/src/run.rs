@@ -12,22 +12,22 @@ use teleop_common::key::Keys;
 use teleop_common::master::{Calibration, MasterGeometry};
 use teleop_common::net::clock::{now, random_epoch};
 use teleop_common::net::keyboard::Keyboard;
-use teleop_common::net::{NetError, Session, Stream, Subscriber};
+use teleop_common::net::{NetError, Session, Subscriber};
 use teleop_common::recording::RecordingHeader;
 use teleop_common::viz::{Level, Scene, Viz};
 use teleop_common::wire::latency_report;
 
 use crate::calibrate;
 use crate::cli::{RunArgs, Switch};
-use crate::failure::{Failure, OrFail as _, open_session};
+use crate::failure::{Failure, OrFail as _, listening_session, not_open};
 use crate::feedback::Feedback;
 use crate::hand::PoseFinder;
-use crate::listen::Listener;
 use crate::pilot::{ClutchBy, Pilot};
 use crate::pipeline::{Parts, Pipeline, Progress, picture_time};
 use crate::record::Recorder;
 use crate::request::{Requester, Requests, Wish};
 use crate::robot_hand::RobotHand;
+use crate::robot_link::RobotLink;
 use crate::shutdown::Shutdown;
 use crate::source::{GestureSource, RecordingFile, Source, SourceSpec, ZenohSource};
 use crate::stream::PoseStream;
@@ -187,7 +187,8 @@ pub fn run(args: &RunArgs, shutdown: &Shutdown, terminal: &Terminal) -> Result<S
     let (is_recording, side) = (plan.is_recording(), plan.side);
     let pilot = Pilot::new(args.clutch.unwrap_or_else(default_clutch), operator_name(args)?, args.takeover);
     let inputs = plan.is_live() || args.clutch == Some(ClutchBy::Input);
-    let session = open_session(&args.robot.connect, if inputs { &args.listen } else { &[] })?;
+    // Of its own, because that with the robot may be opened anew.
+    let local = inputs.then(|| listening_session(&args.listen)).transpose()?;
     let (recorder, record) = match &args.record {
         Some(path) => Recorder::create(path, &args.source, side).map(|(a, b)| (Some(a), Some(b))).or_usage()?,
         None => (None, None),
@@ -195,19 +196,18 @@ pub fn run(args: &RunArgs, shutdown: &Shutdown, terminal: &Terminal) -> Result<S
 
     let epoch = random_epoch();
     let feedback = Arc::new(Feedback::new(epoch));
-    let listener = Listener::start(&session, &keys, &feedback).or_runtime()?;
-    let publisher = session.publisher(&keys.pose(), Stream::Command).or_runtime()?;
-    let token = session.live_token(&keys.live_operator(epoch)).or_runtime()?;
-    let side = side.or_else(|| robot_side(&session, &keys)).unwrap_or(HandSide::Right);
+    let link = RobotLink::open(args.robot.session(), &keys, Some(epoch), &feedback).map_err(not_open)?;
+    let side = side.or_else(|| robot_side(&link, &keys)).unwrap_or(HandSide::Right);
     let scene = Scene::operator(keys.name(), side);
     let viz = Viz::start(args.viewer.clone(), scene).or_runtime()?;
     let logger = viz.logger();
-    let requests = Requests::start(Requester::new(&session, &keys, epoch, &feedback).or_runtime()?).or_runtime()?;
+    let requests = Requests::start(Requester::new(link.sender(), epoch, &feedback)).or_runtime()?;
     let keyboard = listen_to_keys(&pilot, &requests, shutdown);
-    let clutch_input = if inputs { Some(listen_to_clutch(&session, &keys, &pilot).or_runtime()?) } else { None };
-    let (stream, sender) = PoseStream::start(publisher, epoch, Arc::clone(&feedback), pilot.clone()).or_runtime()?;
+    let clutch_input = local.as_ref().map(|local| listen_to_clutch(local, &keys, &pilot)).transpose().or_runtime()?;
+    let (stream, sender) =
+        PoseStream::start(link.sender(), epoch, Arc::clone(&feedback), pilot.clone()).or_runtime()?;
     let pipeline = Pipeline::start(Parts {
-        source: open(plan.input, &session, &keys)?,
+        source: open(plan.input, local.as_ref(), &keys)?,
         finder: plan.finder.filtered(args.filter == Switch::On),
         sender,
         recorder: record,
@@ -246,12 +246,14 @@ pub fn run(args: &RunArgs, shutdown: &Shutdown, terminal: &Terminal) -> Result<S
     // In the order of the data: source, network and recording, picture.
     let (progress, result) = pipeline.join();
     let sent = stream.counters().sent.load(Ordering::Relaxed);
-    drop((stream, token, listener));
+    drop((stream, link));
     let recorded = recorder.map(Recorder::finish);
     if !viz.shutdown(VIEWER_TIMEOUT) {
         tracing::warn!("the viewer did not take everything in time");
     }
-    session.close().or_runtime()?;
+    if let Some(local) = local {
+        local.close().or_runtime()?;
+    }
     result.or_runtime()?;
     if progress.ended && !progress.confirmed {
         tracing::warn!("the robot did not confirm the last pose");
@@ -304,17 +306,18 @@ fn listen_to_clutch(session: &Session, keys: &Keys, pilot: &Pilot) -> Result<Sub
 }
 
 /// The side of the robot's hand, if it is there to say: a hand that belongs to neither side is drawn as that one.
-fn robot_side(session: &Session, keys: &Keys) -> Option<HandSide> {
-    let description = session.get(&keys.describe(), DESCRIBE_TIMEOUT).ok()?;
+fn robot_side(link: &RobotLink, keys: &Keys) -> Option<HandSide> {
+    let description = link.get(&keys.describe(), DESCRIBE_TIMEOUT).ok()?;
     let description: serde_json::Value = serde_json::from_slice(&description).ok()?;
     let side = description.get("hand")?.as_str()?;
     [HandSide::Right, HandSide::Left].into_iter().find(|known| known.name() == side)
 }
 
-fn open(input: Input, session: &Session, keys: &Keys) -> Result<Source, Failure> {
-    match input {
-        Input::Ready(source) => Ok(source),
-        Input::Zenoh => {
+fn open(input: Input, local: Option<&Session>, keys: &Keys) -> Result<Source, Failure> {
+    match (input, local) {
+        (Input::Ready(source), _) => Ok(source),
+        (Input::Zenoh, None) => Err(Failure::Usage(anyhow::anyhow!("--source zenoh needs an endpoint to --listen on"))),
+        (Input::Zenoh, Some(session)) => {
             tracing::info!("hand data may come on {} at {}", keys.hand_input(), session.locators().join(", "));
             ZenohSource::subscribe(session, keys).map(Source::Zenoh).or_runtime()
         }

@@ -7,13 +7,14 @@ use std::time::Duration;
 
 use teleop_common::authority::Intent;
 use teleop_common::master::MasterPose;
+use teleop_common::net::NetError;
 use teleop_common::net::clock::now;
-use teleop_common::net::{NetError, Publisher};
 use teleop_common::time::MonoTime;
 use teleop_common::wire::{PoseMessage, Stamper};
 
 use crate::feedback::Feedback;
 use crate::pilot::Pilot;
+use crate::robot_link::RobotSender;
 
 /// How often the publisher looks whether it should end.
 const LOOK: Duration = Duration::from_millis(100);
@@ -55,13 +56,13 @@ pub struct PoseStream {
 }
 
 impl PoseStream {
-    /// Starts publishing on `publisher` as the process `epoch`, with echoes from `feedback` and what `pilot` wants. When
+    /// Starts publishing through `sender` as the process `epoch`, with echoes from `feedback` and what `pilot` wants. When
     /// it ends it gives the robot back.
     ///
     /// # Errors
     /// The system refuses a thread.
     pub fn start(
-        publisher: Publisher,
+        sender: RobotSender,
         epoch: u64,
         feedback: Arc<Feedback>,
         pilot: Pilot,
@@ -80,7 +81,7 @@ impl PoseStream {
                 };
                 last = Some(outgoing);
                 pilot.step(now(), feedback.snapshot(now()).authority);
-                match send(&publisher, &mut stamper, &feedback, &outgoing, pilot.intent()) {
+                match send(&sender, &mut stamper, &feedback, &outgoing, pilot.intent()) {
                     Ok(sent) => {
                         count.sent.fetch_add(1, Ordering::Relaxed);
                         count.last_sent.store(sent.0, Ordering::Release);
@@ -97,12 +98,12 @@ impl PoseStream {
             for _ in 0..FAREWELLS {
                 let Some(last) = last else { break };
                 let outgoing = Outgoing { captured: now(), ..last };
-                send(&publisher, &mut stamper, &feedback, &outgoing, pilot.farewell(now())).ok();
+                send(&sender, &mut stamper, &feedback, &outgoing, pilot.farewell(now())).ok();
                 std::thread::sleep(FAREWELL_EVERY);
             }
         })?;
-        let sender = PoseSender { slot, publisher: thread.thread().clone() };
-        Ok((Self { counters, stop, thread: Some(thread) }, sender))
+        let poses = PoseSender { slot, publisher: thread.thread().clone() };
+        Ok((Self { counters, stop, thread: Some(thread) }, poses))
     }
 
     /// What was sent so far.
@@ -133,7 +134,7 @@ impl PoseSender {
 }
 
 fn send(
-    publisher: &Publisher,
+    sender: &RobotSender,
     stamper: &mut Stamper,
     feedback: &Feedback,
     outgoing: &Outgoing,
@@ -143,6 +144,6 @@ fn send(
     // Before the pose is on its way, or its echo could come back first.
     feedback.on_sent(sent);
     let header = stamper.header::<PoseMessage>(sent);
-    publisher.send(&PoseMessage::new(header, feedback.echo(sent), outgoing.captured, &outgoing.pose, intent))?;
+    sender.pose(&PoseMessage::new(header, feedback.echo(sent), outgoing.captured, &outgoing.pose, intent))?;
     Ok(sent)
 }

@@ -20,7 +20,7 @@ use teleop_common::time::MonoTime;
 use teleop_common::wire::{Checked, Echo, JointStateMessage, PoseMessage, Stamper, pack_joints};
 use teleop_operator::cli::{Cli, RunArgs};
 use teleop_operator::feedback::Feedback;
-use teleop_operator::listen::Listener;
+use teleop_operator::robot_link::RobotLink;
 use teleop_operator::run::{Summary, run};
 use teleop_operator::shutdown::Shutdown;
 use teleop_operator::terminal::Terminal;
@@ -354,9 +354,9 @@ fn failures_before_anything_runs_are_told_apart() {
 fn watching_needs_a_robot() {
     let peer = Peer::start("watched");
     let watch_name = |name: &str, seconds: f64| {
-        let session = Session::open(&SessionConfig::connecting([peer.endpoint.as_str()])).unwrap();
+        let config = SessionConfig::connecting([peer.endpoint.as_str()]);
         let feedback = Arc::new(Feedback::new(random_epoch()));
-        let _listener = Listener::start(&session, &Keys::new(name).unwrap(), &feedback).unwrap();
+        let _link = RobotLink::open(config, &Keys::new(name).unwrap(), None, &feedback).unwrap();
         let options = WatchOptions {
             json: true,
             duration: Some(Duration::from_secs_f64(seconds)),

@@ -11,6 +11,9 @@ use super::error::words;
 /// it instead of arriving late.
 pub const DEFAULT_LEASE: Duration = Duration::from_millis(1000);
 
+/// Time for the handshake of a link: several round trips within a continent.
+pub const DEFAULT_OPEN_TIMEOUT: Duration = Duration::from_millis(600);
+
 /// The link protocols that are built in.
 const PROTOCOLS: [&str; 4] = ["tcp", "udp", "tls", "quic"];
 
@@ -23,7 +26,7 @@ pub struct SessionConfig {
     /// Endpoints to listen on, such as `tcp/127.0.0.1:7447`; port 0 lets the system choose, see
     /// [`super::Session::locators`]. None: nobody can connect to this process.
     pub listen: Vec<String>,
-    /// Endpoints to connect to; tried for ever, every 0.2 to 2 s, also after a connection was lost.
+    /// Endpoints to connect to; tried for ever, every 0.1 to 0.3 s, also after a connection was lost.
     pub connect: Vec<String>,
     /// A zenoh configuration (JSON5 or YAML) for certificates, access control and link options.
     ///
@@ -32,11 +35,20 @@ pub struct SessionConfig {
     pub zenoh_config_file: Option<PathBuf>,
     /// Silence after which a link counts as dead, [`DEFAULT_LEASE`]. Both ends should agree.
     pub lease: Duration,
+    /// How long the handshake of a link may take, [`DEFAULT_OPEN_TIMEOUT`]. While nobody answers, a try over UDP or QUIC
+    /// takes that long, so a short one finds a link that is back sooner.
+    pub open_timeout: Duration,
 }
 
 impl Default for SessionConfig {
     fn default() -> Self {
-        Self { listen: Vec::new(), connect: Vec::new(), zenoh_config_file: None, lease: DEFAULT_LEASE }
+        Self {
+            listen: Vec::new(),
+            connect: Vec::new(),
+            zenoh_config_file: None,
+            lease: DEFAULT_LEASE,
+            open_timeout: DEFAULT_OPEN_TIMEOUT,
+        }
     }
 }
 
@@ -71,12 +83,12 @@ impl SessionConfig {
         set(&mut config, "listen/exit_on_failure", "true")?;
         set(&mut config, "connect/timeout_ms", "-1")?;
         set(&mut config, "connect/exit_on_failure", "false")?;
-        let retry = r#"{"period_init_ms": 200, "period_max_ms": 2000, "period_increase_factor": 1.5}"#;
+        let retry = r#"{"period_init_ms": 100, "period_max_ms": 300, "period_increase_factor": 1.5}"#;
         set(&mut config, "connect/retry", retry)?;
         set(&mut config, "transport/link/tx/lease", &self.lease.as_millis().to_string())?;
         set(&mut config, "transport/link/rx/max_message_size", &MAX_MESSAGE_SIZE.to_string())?;
         set(&mut config, "transport/unicast/max_sessions", "16")?;
-        set(&mut config, "transport/unicast/open_timeout", "3000")?;
+        set(&mut config, "transport/unicast/open_timeout", &self.open_timeout.as_millis().to_string())?;
         set(&mut config, "transport/unicast/accept_timeout", "3000")?;
         Ok(config)
     }
