@@ -139,12 +139,12 @@ impl FingerIk {
             Start { cap: 0.5 * other * other, reached: kept.residual <= tolerance }
         });
         let cap = known.map_or(f64::INFINITY, |known| known.cap);
-        self.for_each_seed(&problem, known, |seed, bound| {
-            if bound >= best.map_or(f64::INFINITY, |best| best.cost.min(cap)) {
+        self.for_each_seed(&problem, known, |seed, cost, floor| {
+            if floor >= best.map_or(f64::INFINITY, |best| best.cost.min(cap)) {
                 return;
             }
-            // The scan finds the start's own valley too, and there the floor is known.
-            if kept.is_some_and(|kept| kept.converged && apart(seed, &kept.q) < SAME_VALLEY) {
+            // The scan finds the start's own valley too, and there the floor is known: nothing in it costs less.
+            if cost >= cap && kept.is_some_and(|kept| kept.converged && apart(seed, &kept.q) < SAME_VALLEY) {
                 return;
             }
             let other = problem.descend(seed, BUDGET);
@@ -194,18 +194,19 @@ impl FingerIk {
         Problem { chain, target: *target, reference: *reference, weight: mu * mu, lower, upper }
     }
 
-    /// Calls `take(posture, lower bound of the cost in its valley)` for the starts worth a descent, the best first.
-    fn for_each_seed(&self, problem: &Problem<'_>, known: Option<Start>, mut take: impl FnMut(&Angles, f64)) {
+    /// Calls `take(posture, its cost, lower bound of the cost in its valley)` for the starts worth a descent, the best
+    /// first.
+    fn for_each_seed(&self, problem: &Problem<'_>, known: Option<Start>, mut take: impl FnMut(&Angles, f64, f64)) {
         match &self.seeds {
             Seeds::Scan(scan) => {
                 for seed in scan.run(&problem.target, &problem.reference, problem.weight, known) {
                     if seed.cost.is_finite() {
-                        take(&seed.q, seed.floor(problem.weight));
+                        take(&seed.q, seed.cost, seed.floor(problem.weight));
                     }
                 }
             }
             Seeds::Table(table) => {
-                take(&problem.reference, 0.0);
+                take(&problem.reference, f64::INFINITY, 0.0);
                 for mu in [0.0, POSTURE_WEIGHT_MAX] {
                     let cost = |(q, tip): &(Angles, Vector3<f64>)| {
                         let posture: f64 = q.iter().zip(&problem.reference).map(|(a, b)| (a - b).powi(2)).sum();
@@ -219,7 +220,7 @@ impl FingerIk {
                         }
                     }
                     if let Some((q, _)) = table.get(best.1) {
-                        take(q, 0.0);
+                        take(q, f64::INFINITY, 0.0);
                     }
                 }
             }
