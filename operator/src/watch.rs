@@ -252,6 +252,7 @@ fn text_line(
 mod tests {
     use super::*;
     use serde_json::Value;
+    use teleop_common::authority::OperatorName;
     use teleop_common::hand::{HandModel, HandSide};
     use teleop_common::mapping::{MappingParams, Retargeter};
     use teleop_common::master::{Gesture, MasterGeometry, MasterPose};

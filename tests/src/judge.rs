@@ -1,5 +1,6 @@
 //! Whether a robot's commands kept their limits, judged from the outside: by commands and tick numbers alone.
 
+use teleop_common::guard::{MAX_PENETRATION, MotionGuard};
 use teleop_common::hand::{HandModel, JointVector};
 
 use crate::probe::State;
@@ -33,8 +34,8 @@ pub fn commands(states: &[State]) -> Vec<Command> {
     states.iter().map(command).collect()
 }
 
-/// Expects positions, velocities and accelerations within the limits of `hand`; `resolution` (rad) is how exact the
-/// angles are, `rate` in ticks per second.
+/// Expects positions, velocities and accelerations within the limits of `hand`, and the hand out of itself; `resolution`
+/// (rad) is how exact the angles are, `rate` in ticks per second.
 ///
 /// Commands may be any number of ticks apart. If each tick keeps the limits, so do the means: the speed over n ticks,
 /// and the change of speed from n ticks to the next m, whose middles are (n + m) / 2 ticks apart.
@@ -44,8 +45,11 @@ pub fn commands(states: &[State]) -> Vec<Command> {
 #[track_caller]
 pub fn assert_limits(commands: &[Command], hand: &HandModel, rate: f64, resolution: f64) -> Extremes {
     let mut extremes = Extremes { commands: commands.len(), ..Extremes::default() };
+    let guard = MotionGuard::new(hand, 0.0);
     for command in commands {
         assert_eq!(command.q.len(), hand.joints.len());
+        let gap = guard.least_gap(hand, &command.q);
+        assert!(gap >= -MAX_PENETRATION - resolution, "tick {}: {} m inside itself", command.tick, -gap);
         for (q, joint) in command.q.iter().zip(&hand.joints) {
             let inside = (joint.lower - resolution..=joint.upper + resolution).contains(q);
             assert!(inside, "tick {}: {} at {q}, limits {} to {}", command.tick, joint.name, joint.lower, joint.upper);

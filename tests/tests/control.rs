@@ -9,6 +9,7 @@ use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use teleop_common::authority::{Clutch, Intent, Latch, LeaseParams, Takeover};
+use teleop_common::guard::{MAX_PENETRATION, MotionGuard};
 use teleop_common::hand::{HandModel, HandSide, JointVector};
 use teleop_common::mapping::{MappingMode, MappingParams};
 use teleop_common::master::{Gesture, MasterGeometry, MasterPose};
@@ -318,6 +319,7 @@ fn no_stream_of_poses_breaks_a_limit() {
     ] {
         let mut bench = Bench::new(side, mapping);
         let mut dice = Dice::new(seed, 0);
+        let (guard, mut closest) = (MotionGuard::new(&bench.hand, ControlParams::default().tip_overlap), f64::INFINITY);
         let (mut sample, mut sequence, mut wait) = (None, 0, 0_u64);
         let (mut before, mut velocity) = (bench.tick(None), JointVector::zeros(16));
         let (mut fastest, mut holds, mut valid) = (0.0_f64, 0, 0);
@@ -352,9 +354,12 @@ fn no_stream_of_poses_breaks_a_limit() {
                 velocity[slot] = moving;
                 fastest = fastest.max(moving.abs());
             }
+            closest = closest.min(guard.least_gap(&bench.hand, &record.command.q));
+            assert!(closest >= -MAX_PENETRATION, "the hand is {} m inside itself", -closest);
             (before, holds) = (record, record.holds);
         }
-        println!("{}: {valid} poses, {holds} holds, fastest {fastest:.2} rad/s", side.name());
+        let closest = closest * 1e3;
+        println!("{}: {valid} poses, {holds} holds, fastest {fastest:.2} rad/s, gap {closest:.3} mm", side.name());
         assert!(valid > 10_000 && holds > 20 && fastest > 6.9, "{valid} poses, {holds} holds, {fastest} rad/s");
     }
 }

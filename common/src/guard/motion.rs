@@ -185,12 +185,15 @@ impl MotionGuard {
         period: f64,
     ) -> Intervention {
         let mut world = World::new(hand, q);
-        let mut travel = JointVector::zeros(q.len());
+        // By what the joints can do in this tick, and by what they do and are to do.
+        let mut travels = [JointVector::zeros(q.len()); 2];
         for (index, joint) in hand.joints.iter().enumerate() {
-            let speed = low[index].abs().max(high[index].abs());
-            travel[index] = speed * speed / joint.acceleration + 2.0 * speed * period;
+            let (most, now) = (low[index].abs().max(high[index].abs()), 0.5 * (low[index] + high[index]).abs());
+            for (travel, speed) in travels.iter_mut().zip([most, now.max(velocity[index].abs())]) {
+                travel[index] = speed * speed / joint.acceleration + 2.0 * speed * period;
+            }
         }
-        let ways = self.ways(hand, &travel);
+        let [ways, asked] = travels.map(|travel| self.ways(hand, &travel));
         let mut near = List::<Near, MAX_NEAR>::new();
         let mut contacts = List::<Contact, MAX_CONTACTS>::new();
         let mut complete = true;
@@ -204,9 +207,13 @@ impl MotionGuard {
                 continue;
             }
             complete &= near.push(Near { pair: index as u16, gap, least: gap.min(ROUNDING - pair.stop) });
+            let reach = pair.way(&asked);
+            if gap + pair.hold >= reach.max(SAME) {
+                continue;
+            }
             world.each(hand, pair, |points, radii| {
                 let room = (points[1] - points[0]).norm() - radii + pair.hold;
-                if room < reach {
+                if room < reach.max(SAME) {
                     contacts.push_worst(world.contact(hand, pair, points, room, movable));
                 }
             });
@@ -265,20 +272,23 @@ impl MotionGuard {
         let braking = |speed: f64, acceleration: f64| speed * speed / (2.0 * acceleration) + speed * period;
         for (index, joint) in hand.joints.iter().enumerate() {
             travel[index] = braking(v[index].abs(), joint.acceleration);
+            step[index] = v[index].abs() * period;
         }
         let mut open = List::<Near, MAX_NEAR>::new();
-        let ways = self.ways(hand, &travel);
+        let (ways, steps) = (self.ways(hand, &travel), self.ways(hand, &step));
         let mut involved = [false; MAX_FINGERS];
+        // Ticks for which nothing can get too near.
+        let ticks = |pair: &Pair, room: f64, steps: &[f64; BODIES]| (room.max(0.0) / pair.way(steps)) as usize;
+        let mut idle = MAX_BRAKING;
         for item in &near.items[..near.len] {
             let pair = &self.pairs[usize::from(item.pair)];
             // What is too far away for the way to brake needs no look.
             if item.gap < item.least + pair.way(&ways) {
                 open.push(*item);
+                idle = idle.min(ticks(pair, item.gap - item.least, &steps));
                 pair.fingers().for_each(|finger| involved[finger] = true);
             }
         }
-        // Ticks for which nothing can get too near.
-        let mut idle = 0;
         for _ in 0..MAX_BRAKING {
             if open.len == 0 {
                 return None;
@@ -318,7 +328,7 @@ impl MotionGuard {
                 if gap >= reach - SAME {
                     open.remove(index);
                 } else {
-                    idle = idle.min(((gap - least).max(0.0) / pair.way(&steps)) as usize);
+                    idle = idle.min(ticks(pair, gap - least, &steps));
                     index += 1;
                 }
             }
