@@ -11,6 +11,7 @@ use std::io::BufReader;
 
 use nalgebra::Vector3;
 use suite::Suite;
+use teleop_common::authority::Intent;
 use teleop_common::guard::TipGuard;
 use teleop_common::hand::{FingerChain, HandModel, HandSide, JointVector, MAX_FINGER_JOINTS, MAX_FINGERS, TipFrame};
 use teleop_common::ik::FingerIk;
@@ -196,7 +197,7 @@ fn codec(suite: &mut Suite, poses: &[MasterPose]) {
     let now = MonoTime(1);
     let messages: Vec<PoseMessage> = poses
         .iter()
-        .map(|pose| PoseMessage::new(Header::new::<PoseMessage>(1, 1, now), Echo::NONE, now, pose))
+        .map(|pose| PoseMessage::new(Header::new::<PoseMessage>(1, 1, now), Echo::NONE, now, pose, Intent::default()))
         .collect();
     let mut buffer = [0; MAX_MESSAGE];
     suite.run("codec, encode a pose", &messages, |message| {
