@@ -373,6 +373,7 @@ mod tests {
             deliver(&mut receiver, &PoseMessage::new(header, Echo::NONE, stamp, &pose, intent), 1011);
         }
         assert_eq!(receiver.echo().epoch, 7);
+        assert_eq!(slot.pop().unwrap().sequence, 1);
         // Without an echo: its clock is still known.
         send(&mut receiver, 7, 2, 1020, false);
         assert_eq!(slot.pop().unwrap().sequence, 2);
