@@ -40,7 +40,7 @@ pub enum PlayoutMode {
     Auto,
     /// The newest pose at once, always.
     Direct,
-    /// [`PlayoutParams::max_delay`], always.
+    /// [`PlayoutParams::max_delay`] behind the capture, always.
     Fixed,
 }
 
@@ -49,7 +49,7 @@ pub enum PlayoutMode {
 pub struct PlayoutParams {
     /// How the delay is chosen.
     pub mode: PlayoutMode,
-    /// Largest delay behind the capture.
+    /// Largest delay that is added to the least that the link takes.
     pub max_delay: Duration,
     /// Unevenness that is played as it comes.
     pub tolerance: Duration,
@@ -215,6 +215,6 @@ impl Playout {
         let uneven = need - (transit + period);
         let tolerance = self.params.tolerance.as_secs_f64();
         self.buffers = uneven > if self.buffers { CALM * tolerance } else { tolerance };
-        if self.buffers { need.min(most) } else { 0.0 }
+        if self.buffers { need.min(transit + most) } else { 0.0 }
     }
 }

@@ -358,7 +358,9 @@ mod tests {
             "robot allegro  engaged  |  100.0 Hz  |  rtt 1.2 ms  |  pose age at robot 3.1 ms (p99)"
         );
         assert_eq!(status_line(&status(None)), "robot allegro  not connected (tcp/127.0.0.1:7447)  |  100.0 Hz");
-        assert!(status_line(&status(Some(Mode::Holding))).starts_with("robot allegro  holding: close the clutch anew  |"));
+        assert!(
+            status_line(&status(Some(Mode::Holding))).starts_with("robot allegro  holding: close the clutch anew  |")
+        );
         let progress = Progress {
             activity: Activity::Calibrating(0.4),
             residual: Some(0.0031),
