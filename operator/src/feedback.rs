@@ -112,9 +112,9 @@ impl std::fmt::Display for Reason {
             Self::Refused(Rejection::Operator) | Self::OtherOperator => {
                 f.write_str("another operator has it (--takeover, if the robot permits it)")
             }
-            Self::Clutch => f.write_str("close the clutch"),
+            Self::Clutch => f.write_str("close the clutch (SPACE)"),
             Self::OnItsWay => f.write_str("on its way"),
-            Self::CloseAnew => f.write_str("close the clutch anew"),
+            Self::CloseAnew => f.write_str("close the clutch anew (SPACE)"),
             Self::Stopped => f.write_str("reset the stop (here: r)"),
             Self::Refused(rejection) => write!(f, "poses refused: {}", rejection.name()),
             Self::Fault(code) => write!(f, "fault {code}, restart the robot"),
