@@ -8,7 +8,8 @@
 //! On a good link all that is smooth already, and a delay of a period would be for nothing. So [`PlayoutMode::Auto`]
 //! plays the newest pose at once ([`Playout::delay`] is zero) until the needs exceed the least possible one by
 //! [`PlayoutParams::tolerance`], and goes back when they no longer do. The delay changes slowly, as time running a little
-//! faster or slower, and never by a jump.
+//! faster or slower, and never by a jump. Over a gap that the delay does not cover the motion goes on a little, and comes
+//! to rest.
 
 use std::time::Duration;
 
@@ -53,7 +54,9 @@ pub struct PlayoutParams {
     pub max_delay: Duration,
     /// Unevenness that is played as it comes.
     pub tolerance: Duration,
-    /// Time constant of the prediction over a gap; zero: the last pose stays.
+    /// Time constant of the prediction over a gap, while there is a delay: the motion goes on, slower and slower. Zero:
+    /// the last pose stays. The default is the best for a recorded hand (`tests/playout.rs`): over gaps of 33, 67 and
+    /// 100 ms its error is 29, 21 and 16 % below that of holding.
     pub predict: Duration,
 }
 
@@ -63,7 +66,7 @@ impl Default for PlayoutParams {
             mode: PlayoutMode::Auto,
             max_delay: Duration::from_millis(200),
             tolerance: Duration::from_millis(8),
-            predict: Duration::ZERO,
+            predict: Duration::from_millis(40),
         }
     }
 }
@@ -175,17 +178,18 @@ impl Playout {
 
     /// Beyond the newest pose: that, or a little farther the way it went.
     fn predict(&self, newest: Entry, time: MonoTime) -> Played {
-        let mut pose = newest.pose;
         let tau = self.params.predict.as_secs_f64();
         let before = self.poses.len().checked_sub(2).map(|index| self.poses[index]);
-        if let (Some(before), true) = (before.filter(|_| self.delay > 0.0), tau > 0.0) {
+        let (mut pose, mut captured) = (newest.pose, newest.captured);
+        if let (Some(before), true) = (before, self.delay > 0.0 && tau > 0.0) {
             let period = newest.captured.since(before.captured).as_secs_f64();
             let ahead = tau * (1.0 - (-time.since(newest.captured).as_secs_f64() / tau).exp());
             for (joint, angle) in pose.q.iter_mut().enumerate() {
                 *angle += (*angle - before.pose.q[joint]) / period * ahead;
             }
+            captured = captured + Duration::from_secs_f64(ahead);
         }
-        Played { pose, captured: newest.captured }
+        Played { pose, captured }
     }
 
     /// The delay that would be right now, s.

@@ -1,9 +1,11 @@
 //! The playout buffer in virtual time: delay where it is needed, evenness, no jumps.
 #![allow(clippy::unwrap_used, reason = "helpers of tests")]
 
+mod master_support;
+
 use std::time::Duration;
 
-use teleop_common::master::{MasterGeometry, MasterPose};
+use teleop_common::master::{Calibrator, Filter, FilterSettings, Fitter, MasterGeometry, MasterPose};
 use teleop_common::playout::{Playout, PlayoutMode, PlayoutParams};
 use teleop_common::time::MonoTime;
 
@@ -135,4 +137,42 @@ fn a_reset_forgets_the_other_operator() {
     assert_eq!(playout.play(MonoTime(4000)), None);
     playout.push(MonoTime(10), MonoTime(4500), &pose(2.0));
     assert_eq!(playout.play(MonoTime(5000)).unwrap().pose, pose(2.0), "an earlier capture of another clock");
+}
+
+/// What a gap in a real hand's motion is best filled with. Prints the table from which the default was chosen.
+#[test]
+fn a_damped_prediction_is_better_than_holding_and_a_linear_one_is_not() {
+    let Some(keypoints) = master_support::recorded() else { return };
+    let mut calibrator = Calibrator::default();
+    keypoints.iter().for_each(|frame| calibrator.push(frame));
+    let calibration = calibrator.finish().unwrap();
+    let mut fitter = Fitter::new(calibration.geometry, calibration.side);
+    let mut filter = Filter::new(calibration.geometry, FilterSettings::default());
+    let frames: Vec<_> = keypoints.iter().map(|frame| (frame, fitter.fit(frame).q)).collect();
+    let motion: Vec<[f64; 20]> = frames.iter().map(|(frame, q)| filter.apply(1.0 / 30.0, frame, q)).collect();
+    // Root mean square over joints and frames, mrad, of a prediction over `gap` frames with this time constant (s).
+    let error = |gap: usize, tau: f64| {
+        let time = gap as f64 / 30.0;
+        let ahead = if tau > 0.0 { tau * (1.0 - (-time / tau).exp()) } else { 0.0 };
+        let (mut sum, mut count) = (0.0, 0.0);
+        for frame in 1..motion.len() - gap {
+            for joint in 0..20 {
+                let velocity = (motion[frame][joint] - motion[frame - 1][joint]) * 30.0;
+                sum += (motion[frame][joint] + velocity * ahead - motion[frame + gap][joint]).powi(2);
+                count += 1.0;
+            }
+        }
+        1e3 * (sum / count as f64).sqrt()
+    };
+    println!("gap ms | hold | tau 10 ms | 20 ms | 40 ms | 80 ms | linear  (rms error, mrad)");
+    for gap in 1..=3 {
+        let hold = error(gap, 0.0);
+        let taus = [0.01, 0.02, 0.04, 0.08];
+        let (damped, linear) = (taus.map(|tau| error(gap, tau)), error(gap, 1e3));
+        println!("{:.0} | {hold:.1} | {damped:.1?} | {linear:.1}", gap as f64 / 0.03);
+        let own = error(gap, PlayoutParams::default().predict.as_secs_f64());
+        assert!(own < 0.9 * hold, "{own} mrad where holding gives {hold}");
+        assert!(own < 1.02 * damped.into_iter().fold(linear, f64::min), "another would be better");
+    }
+    assert!(error(3, 1e3) > error(3, 0.0), "over a tenth of a second a straight line is worse than holding");
 }

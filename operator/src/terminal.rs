@@ -359,7 +359,8 @@ mod tests {
         );
         assert_eq!(status_line(&status(None)), "robot allegro  not connected (tcp/127.0.0.1:7447)  |  100.0 Hz");
         assert!(
-            status_line(&status(Some(Mode::Holding))).starts_with("robot allegro  holding: close the clutch anew (SPACE)  |")
+            status_line(&status(Some(Mode::Holding)))
+                .starts_with("robot allegro  holding: close the clutch anew (SPACE)  |")
         );
         let progress = Progress {
             activity: Activity::Calibrating(0.4),

@@ -209,7 +209,7 @@ impl Telemetry {
             q_command: tick.command.q,
             mapping: tick.mapping,
             mode: tick.mode,
-            pose_age: tick.sample.map(|sample| tick.now.since(sample.captured).as_secs_f64()),
+            pose_age: tick.played.map(|captured| tick.now.since(captured).as_secs_f64()),
             tick: Some(self.slowest.as_secs_f64()),
         });
         self.slowest = Duration::ZERO;
