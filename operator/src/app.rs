@@ -134,7 +134,7 @@ fn stop_robot(args: &StopArgs) -> Result<(), Failure> {
 }
 
 fn list_robots(args: &ListArgs, shutdown: &Shutdown) -> Result<(), Failure> {
-    let session = Session::open(&args.tls.session(&args.connect)).map_err(not_open)?;
+    let session = Session::open(&args.link.session(&args.connect)).map_err(not_open)?;
     list(&session, Duration::from_secs_f64(args.time), args.json, shutdown).or_runtime()?;
     Ok(())
 }

@@ -81,21 +81,24 @@ pub struct RobotArgs {
     /// Where the robot listens; repeatable
     #[arg(long, default_value = ROBOT_ENDPOINT, value_name = "ENDPOINT")]
     pub connect: Vec<String>,
-    /// Certificates.
+    /// How to connect.
     #[command(flatten)]
-    pub tls: TlsArgs,
+    pub link: LinkArgs,
 }
 
 impl RobotArgs {
     /// The session with the robot.
     pub(crate) fn session(&self) -> SessionConfig {
-        self.tls.session(&self.connect)
+        self.link.session(&self.connect)
     }
 }
 
-/// Certificates for quic/ and tls/ endpoints.
+/// Through a router or not, and certificates for quic/ and tls/ endpoints.
 #[derive(Args, Clone, Debug)]
-pub struct TlsArgs {
+pub struct LinkArgs {
+    /// --connect names Zenoh routers, which the robot is connected to as well
+    #[arg(long)]
+    pub router: bool,
     /// Certificate authority (PEM): only a robot that has a certificate of it is connected to
     #[arg(long, value_name = "FILE", requires_all = ["tls_cert", "tls_key"], help_heading = "Security")]
     pub tls_ca: Option<PathBuf>,
@@ -107,7 +110,7 @@ pub struct TlsArgs {
     pub tls_key: Option<PathBuf>,
 }
 
-impl TlsArgs {
+impl LinkArgs {
     /// A session that connects to `endpoints`.
     pub(crate) fn session(&self, endpoints: &[String]) -> SessionConfig {
         let tls = match (&self.tls_ca, &self.tls_cert, &self.tls_key) {
@@ -116,7 +119,7 @@ impl TlsArgs {
             }
             _ => None,
         };
-        SessionConfig { tls, ..SessionConfig::connecting(endpoints.iter().cloned()) }
+        SessionConfig { router: self.router, tls, ..SessionConfig::connecting(endpoints.iter().cloned()) }
     }
 }
 
@@ -225,9 +228,9 @@ pub struct ListArgs {
     /// A robot or a router that robots are connected to; repeatable
     #[arg(long, default_value = ROBOT_ENDPOINT, value_name = "ENDPOINT")]
     pub connect: Vec<String>,
-    /// Certificates.
+    /// How to connect.
     #[command(flatten)]
-    pub tls: TlsArgs,
+    pub link: LinkArgs,
     /// How long to listen to the robots found
     #[arg(long, default_value_t = 1.0, value_name = "SECONDS", value_parser = seconds)]
     pub time: f64,

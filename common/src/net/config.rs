@@ -28,6 +28,10 @@ pub struct SessionConfig {
     pub listen: Vec<String>,
     /// Endpoints to connect to; tried for ever, every 0.1 to 0.3 s, also after a connection was lost.
     pub connect: Vec<String>,
+    /// The endpoints to connect to are routers. Between two peers of one router zenoh passes nothing on, because it
+    /// expects them to reach each other; so of robot and operator one, the operator, has to be a client. A router that
+    /// does not answer within 3 s is then an error.
+    pub router: bool,
     /// Certificates for `tls/` and `quic/` endpoints; both sides of a link must show one.
     pub tls: Option<Tls>,
     /// Who may do what; `None`: anybody who can connect may do anything. Names are known from certificates only, so it
@@ -50,6 +54,7 @@ impl Default for SessionConfig {
         Self {
             listen: Vec::new(),
             connect: Vec::new(),
+            router: false,
             tls: None,
             access: None,
             zenoh_config_file: None,
@@ -84,13 +89,14 @@ impl SessionConfig {
         if !self.connect.is_empty() {
             set(&mut config, "connect/endpoints", &endpoints(&self.connect)?)?;
         }
-        set(&mut config, "mode", "\"peer\"")?;
+        let (mode, patience) = if self.router { ("\"client\"", "3000") } else { ("\"peer\"", "-1") };
+        set(&mut config, "mode", mode)?;
         set(&mut config, "scouting/multicast/enabled", "false")?;
         set(&mut config, "scouting/gossip/enabled", "false")?;
         set(&mut config, "listen/timeout_ms", "0")?;
         set(&mut config, "listen/exit_on_failure", "true")?;
-        set(&mut config, "connect/timeout_ms", "-1")?;
-        set(&mut config, "connect/exit_on_failure", "false")?;
+        set(&mut config, "connect/timeout_ms", patience)?;
+        set(&mut config, "connect/exit_on_failure", if self.router { "true" } else { "false" })?;
         let retry = r#"{"period_init_ms": 100, "period_max_ms": 300, "period_increase_factor": 1.5}"#;
         set(&mut config, "connect/retry", retry)?;
         set(&mut config, "transport/link/tx/lease", &self.lease.as_millis().to_string())?;

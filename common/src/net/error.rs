@@ -76,6 +76,16 @@ pub enum NetError {
         /// What zenoh says.
         reason: String,
     },
+    /// No router is there.
+    #[error(
+        "no router answers at {connect:?}: is it running, the address right, and the certificate one it takes? ({reason})"
+    )]
+    NoRouter {
+        /// Endpoints to connect to.
+        connect: Vec<String>,
+        /// What zenoh says.
+        reason: String,
+    },
     /// A declaration or an exchange on a key failed.
     #[error("cannot {action} {key}: {reason}")]
     Key {

@@ -55,6 +55,7 @@ impl Tls {
             rustls::Error::InconsistentKeys(_) => {
                 refused(&self.key, format!("it is not the key of {}", self.certificate.display()))
             }
+            rustls::Error::InvalidCertificate(_) => refused(&self.certificate, why(&error, &self.ca)),
             error => refused(&self.key, error.to_string()),
         })?;
         let mut roots = RootCertStore::empty();
