@@ -650,7 +650,7 @@ fn connections_that_say_nothing_or_nonsense_disturb_nothing() {
 fn router(certificates: &Certificates, others: &[&str]) -> (zenoh::Session, String) {
     let settings = serde_json::json!({
         "mode": "router",
-        "listen": { "endpoints": ["tls/127.0.0.1:0"] },
+        "listen": { "endpoints": ["quic/127.0.0.1:0?mixed_rel=auto"] },
         "connect": { "endpoints": others },
         "scouting": { "multicast": { "enabled": false } },
         "transport": tls_settings(&certificates.tls("router")),
