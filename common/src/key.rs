@@ -7,7 +7,8 @@ use thiserror::Error;
 
 /// Longest robot name, characters.
 pub const MAX_NAME: usize = 32;
-const ROOT: &str = "allegro/v1";
+/// What all keys begin with.
+pub(crate) const ROOT: &str = "allegro/v1";
 
 /// A robot name that is not one.
 #[derive(Clone, Debug, PartialEq, Eq, Error)]

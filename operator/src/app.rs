@@ -8,7 +8,7 @@ use anyhow::{Context as _, anyhow};
 use teleop_common::key::Keys;
 use teleop_common::master::Gesture;
 use teleop_common::net::clock::random_epoch;
-use teleop_common::net::{Session, SessionConfig, keyboard};
+use teleop_common::net::{Session, keyboard};
 
 use crate::calibrate;
 use crate::cli::{Cli, Command, ListArgs, LogArgs, StopArgs, WatchArgs};
@@ -134,8 +134,7 @@ fn stop_robot(args: &StopArgs) -> Result<(), Failure> {
 }
 
 fn list_robots(args: &ListArgs, shutdown: &Shutdown) -> Result<(), Failure> {
-    let config = SessionConfig::connecting(args.connect.iter().cloned());
-    let session = Session::open(&config).map_err(not_open)?;
+    let session = Session::open(&args.link.session(&args.connect)).map_err(not_open)?;
     list(&session, Duration::from_secs_f64(args.time), args.json, shutdown).or_runtime()?;
     Ok(())
 }

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
-use teleop_common::net::SessionConfig;
+use teleop_common::net::{SessionConfig, Tls};
 use teleop_common::viz::Viewer;
 
 use crate::pilot::ClutchBy;
@@ -21,6 +21,8 @@ Examples:
   operator --source hand.csv --loop              a recording, again and again
   operator --source zenoh --calibration me.toml  hand data from any program, see below
   operator --connect tcp/192.168.0.7:7447        a robot on another machine
+  operator --connect quic/robot.example.org:7447 --tls-ca ca.pem --tls-cert ada.pem --tls-key ada.key
+                                                 over the internet, encrypted (files: see deploy/certificates)
   operator calibrate --source hand.csv --output me.toml
   operator --clutch auto                         a demonstration: follow whenever the robot is ready
   operator watch --json --duration 5             what the robot does, as JSON lines
@@ -79,12 +81,45 @@ pub struct RobotArgs {
     /// Where the robot listens; repeatable
     #[arg(long, default_value = ROBOT_ENDPOINT, value_name = "ENDPOINT")]
     pub connect: Vec<String>,
+    /// How to connect.
+    #[command(flatten)]
+    pub link: LinkArgs,
 }
 
 impl RobotArgs {
     /// The session with the robot.
     pub(crate) fn session(&self) -> SessionConfig {
-        SessionConfig::connecting(self.connect.iter().cloned())
+        self.link.session(&self.connect)
+    }
+}
+
+/// Through a router or not, and certificates for quic/ and tls/ endpoints.
+#[derive(Args, Clone, Debug)]
+pub struct LinkArgs {
+    /// --connect names Zenoh routers, which the robot is connected to as well
+    #[arg(long)]
+    pub router: bool,
+    /// Certificate authority (PEM): only a robot that has a certificate of it is connected to
+    #[arg(long, value_name = "FILE", requires_all = ["tls_cert", "tls_key"], help_heading = "Security")]
+    pub tls_ca: Option<PathBuf>,
+    /// This operator's certificate (PEM); its common name is what the robot's --allow-operator names
+    #[arg(long, value_name = "FILE", requires_all = ["tls_ca", "tls_key"], help_heading = "Security")]
+    pub tls_cert: Option<PathBuf>,
+    /// The certificate's private key (PEM)
+    #[arg(long, value_name = "FILE", requires_all = ["tls_ca", "tls_cert"], help_heading = "Security")]
+    pub tls_key: Option<PathBuf>,
+}
+
+impl LinkArgs {
+    /// A session that connects to `endpoints`.
+    pub(crate) fn session(&self, endpoints: &[String]) -> SessionConfig {
+        let tls = match (&self.tls_ca, &self.tls_cert, &self.tls_key) {
+            (Some(ca), Some(certificate), Some(key)) => {
+                Some(Tls { ca: ca.clone(), certificate: certificate.clone(), key: key.clone() })
+            }
+            _ => None,
+        };
+        SessionConfig { router: self.router, tls, ..SessionConfig::connecting(endpoints.iter().cloned()) }
     }
 }
 
@@ -193,6 +228,9 @@ pub struct ListArgs {
     /// A robot or a router that robots are connected to; repeatable
     #[arg(long, default_value = ROBOT_ENDPOINT, value_name = "ENDPOINT")]
     pub connect: Vec<String>,
+    /// How to connect.
+    #[command(flatten)]
+    pub link: LinkArgs,
     /// How long to listen to the robots found
     #[arg(long, default_value_t = 1.0, value_name = "SECONDS", value_parser = seconds)]
     pub time: f64,

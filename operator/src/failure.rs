@@ -50,12 +50,7 @@ impl<T, E: Into<anyhow::Error>> OrFail<T> for Result<T, E> {
 
 /// The failure of a session that does not open: a bad endpoint is wrong usage, a taken port is not.
 pub(crate) fn not_open(error: NetError) -> Failure {
-    match error {
-        NetError::Endpoint { .. } | NetError::Setting { .. } | NetError::ConfigFile { .. } => {
-            Failure::Usage(error.into())
-        }
-        error => Failure::Runtime(error.into()),
-    }
+    if error.is_usage() { Failure::Usage(error.into()) } else { Failure::Runtime(error.into()) }
 }
 
 /// Opens a session that only listens.

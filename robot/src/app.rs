@@ -11,7 +11,7 @@ use anyhow::Context as _;
 use teleop_common::hand::{FingerChain, HandModel, Joint};
 use teleop_common::key::Keys;
 use teleop_common::net::keyboard::Keyboard;
-use teleop_common::net::{Session, SessionConfig, clock};
+use teleop_common::net::{Session, clock};
 use teleop_common::viz::{Hub, HubOptions, Scene, Viz};
 use teleop_common::wire;
 
@@ -76,11 +76,7 @@ fn run(args: &RunArgs) -> anyhow::Result<()> {
     let keys = Keys::new(&args.name).map_err(|error| UsageError(format!("--name: {error}")))?;
     let controller =
         Controller::new(hand.clone(), config.mapping.clone(), config.control).map_err(ConfigError::from)?;
-    let session = Session::open(&SessionConfig {
-        listen: args.listen.clone(),
-        zenoh_config_file: args.zenoh.clone(),
-        ..SessionConfig::default()
-    })?;
+    let session = Session::open(&args.network.session())?;
     let epoch = clock::random_epoch();
     let viz = Viz::start(args.viewer.clone(), Scene::robot(&args.name, &hand))?;
 

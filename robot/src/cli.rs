@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use teleop_common::hand::HandSide;
 use teleop_common::mapping::MappingMode;
+use teleop_common::net::{Access, SessionConfig, Tls};
 use teleop_common::viz::Viewer;
 
 use crate::config::{HandSource, Overrides};
@@ -15,6 +16,9 @@ Examples:
   robot                                     a simulated right Allegro Hand on this machine, picture in the browser
   robot --hand left --name lefty            the left hand, under another name
   robot --listen tcp/0.0.0.0:7447           let an operator on another machine connect
+  robot --listen quic/0.0.0.0:7447 --tls-ca ca.pem --tls-cert robot.pem --tls-key robot.key --allow-operator ada
+                                            over the internet, for the operator whose certificate says ada (files: see
+                                            deploy/certificates; which link for which network: deploy/NETWORK.md)
   robot --preset paper --mode cartesian     the paper's parameters, Cartesian mapping only
   robot --viewer connect=192.168.0.5        show in the viewer of another machine
   robot retarget --input hand.csv --output joints.jsonl
@@ -144,6 +148,62 @@ pub struct LogArgs {
     pub log: Option<String>,
 }
 
+/// Where operators connect, and who may.
+#[derive(Args, Clone, Debug)]
+pub struct NetworkArgs {
+    /// Where operators connect; repeatable. quic/ and tls/ are encrypted, udp/ and tcp/ are not
+    #[arg(long, default_value = "tcp/127.0.0.1:7447", value_name = "ENDPOINT", help_heading = "Network")]
+    pub listen: Vec<String>,
+    /// A router to connect to, over which operators reach this robot; repeatable
+    #[arg(long, value_name = "ENDPOINT", help_heading = "Network")]
+    pub connect: Vec<String>,
+    /// A zenoh configuration file for link options
+    #[arg(long, value_name = "FILE", help_heading = "Network")]
+    pub zenoh: Option<PathBuf>,
+    /// Certificate authority (PEM): only who has a certificate of it can connect
+    #[arg(long, value_name = "FILE", requires_all = ["tls_cert", "tls_key"], help_heading = "Security")]
+    pub tls_ca: Option<PathBuf>,
+    /// This robot's certificate (PEM), with the names that operators connect to
+    #[arg(long, value_name = "FILE", requires_all = ["tls_ca", "tls_key"], help_heading = "Security")]
+    pub tls_cert: Option<PathBuf>,
+    /// The certificate's private key (PEM)
+    #[arg(long, value_name = "FILE", requires_all = ["tls_ca", "tls_cert"], help_heading = "Security")]
+    pub tls_key: Option<PathBuf>,
+    /// Common name of a certificate that may drive, stop and watch; repeatable. With this or --allow-observer whoever is
+    /// not named may nothing
+    #[arg(long, value_name = "NAME", value_parser = common_name, help_heading = "Security")]
+    pub allow_operator: Vec<String>,
+    /// Common name of a certificate that may stop and watch; repeatable
+    #[arg(long, value_name = "NAME", value_parser = common_name, help_heading = "Security")]
+    pub allow_observer: Vec<String>,
+}
+
+impl NetworkArgs {
+    /// The session with operators.
+    #[must_use]
+    pub fn session(&self) -> SessionConfig {
+        let tls = match (&self.tls_ca, &self.tls_cert, &self.tls_key) {
+            (Some(ca), Some(certificate), Some(key)) => {
+                Some(Tls { ca: ca.clone(), certificate: certificate.clone(), key: key.clone() })
+            }
+            _ => None,
+        };
+        let access = Access { operators: self.allow_operator.clone(), observers: self.allow_observer.clone() };
+        SessionConfig {
+            listen: self.listen.clone(),
+            connect: self.connect.clone(),
+            tls,
+            access: (access != Access::default()).then_some(access),
+            zenoh_config_file: self.zenoh.clone(),
+            ..SessionConfig::default()
+        }
+    }
+}
+
+fn common_name(text: &str) -> Result<String, String> {
+    if text.is_empty() { Err("it must be a name".to_owned()) } else { Ok(text.to_owned()) }
+}
+
 /// Options of `robot run`.
 #[derive(Args, Clone, Debug)]
 pub struct RunArgs {
@@ -153,12 +213,9 @@ pub struct RunArgs {
     /// Hand and mapping.
     #[command(flatten)]
     pub hand: HandArgs,
-    /// Where operators connect; repeatable
-    #[arg(long, default_value = "tcp/127.0.0.1:7447", value_name = "ENDPOINT", help_heading = "Network")]
-    pub listen: Vec<String>,
-    /// A zenoh configuration file for certificates and link options
-    #[arg(long, value_name = "FILE", help_heading = "Network")]
-    pub zenoh: Option<PathBuf>,
+    /// Network.
+    #[command(flatten)]
+    pub network: NetworkArgs,
     /// The picture: web, web=ADDRESS, connect=URL, save=FILE.rrd or off
     #[arg(long, default_value = "web", value_name = "VIEWER")]
     pub viewer: Viewer,

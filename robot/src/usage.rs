@@ -12,8 +12,6 @@ pub struct UsageError(pub String);
 /// Whether the user can mend this cause of an error on the command line or in a file.
 #[must_use]
 pub fn is_usage(cause: &(dyn std::error::Error + 'static)) -> bool {
-    let of_endpoint = |error: &NetError| {
-        matches!(error, NetError::Endpoint { .. } | NetError::Setting { .. } | NetError::ConfigFile { .. })
-    };
-    cause.is::<ConfigError>() || cause.is::<UsageError>() || cause.downcast_ref().is_some_and(of_endpoint)
+    let of_network = |error: &NetError| error.is_usage();
+    cause.is::<ConfigError>() || cause.is::<UsageError>() || cause.downcast_ref().is_some_and(of_network)
 }

@@ -2,6 +2,7 @@
 //!
 //! | module | one line |
 //! |---|---|
+//! | [`certificates`] | an authority and certificates of it |
 //! | [`process`] | the real binaries as child processes |
 //! | [`probe`] | what a robot publishes, with arrival times |
 //! | [`judge`] | whether a robot's commands kept their limits |
@@ -10,6 +11,7 @@
 
 use std::time::{Duration, Instant};
 
+pub mod certificates;
 pub mod judge;
 pub mod probe;
 pub mod process;

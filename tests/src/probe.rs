@@ -62,7 +62,16 @@ impl Probe {
     /// If no session can be opened.
     #[must_use]
     pub fn connect(endpoint: &str) -> Self {
-        let session = Session::open(&SessionConfig::connecting([endpoint])).unwrap();
+        Self::open(&SessionConfig::connecting([endpoint]))
+    }
+
+    /// The same over a session of its own kind.
+    ///
+    /// # Panics
+    /// If no session can be opened.
+    #[must_use]
+    pub fn open(config: &SessionConfig) -> Self {
+        let session = Session::open(config).unwrap();
         let keys = Keys::new("allegro").unwrap();
         let seen = Arc::<Mutex<Seen>>::default();
         let inbox = || Arc::clone(&seen);

@@ -4,8 +4,8 @@ use std::time::Duration;
 use zenoh::Config;
 use zenoh::config::EndPoint;
 
-use super::NetError;
 use super::error::words;
+use super::{Access, NetError, Tls};
 
 /// Silence after which a link counts as dead. zenoh closes it then, and what an outage kept in buffers is lost with
 /// it instead of arriving late.
@@ -28,7 +28,16 @@ pub struct SessionConfig {
     pub listen: Vec<String>,
     /// Endpoints to connect to; tried for ever, every 0.1 to 0.3 s, also after a connection was lost.
     pub connect: Vec<String>,
-    /// A zenoh configuration (JSON5 or YAML) for certificates, access control and link options.
+    /// The endpoints to connect to are routers. Between two peers of one router zenoh passes nothing on, because it
+    /// expects them to reach each other; so of robot and operator one, the operator, has to be a client. A router that
+    /// does not answer within 3 s is then an error.
+    pub router: bool,
+    /// Certificates for `tls/` and `quic/` endpoints; both sides of a link must show one.
+    pub tls: Option<Tls>,
+    /// Who may do what; `None`: anybody who can connect may do anything. Names are known from certificates only, so it
+    /// takes [`Self::tls`] and encrypted endpoints.
+    pub access: Option<Access>,
+    /// A zenoh configuration (JSON5 or YAML) for link options.
     ///
     /// Its endpoints count where the list above is empty. What keeps old commands and strangers out is set over it:
     /// peer mode, no discovery, lease, message size, retry.
@@ -45,6 +54,9 @@ impl Default for SessionConfig {
         Self {
             listen: Vec::new(),
             connect: Vec::new(),
+            router: false,
+            tls: None,
+            access: None,
             zenoh_config_file: None,
             lease: DEFAULT_LEASE,
             open_timeout: DEFAULT_OPEN_TIMEOUT,
@@ -69,6 +81,7 @@ impl SessionConfig {
             Some(path) => Config::from_file(path)
                 .map_err(|error| NetError::ConfigFile { path: path.clone(), reason: words(&error) })?,
         };
+        self.check_security()?;
         // An absent file means "listen nowhere", not zenoh's default of all interfaces.
         if !self.listen.is_empty() || self.zenoh_config_file.is_none() {
             set(&mut config, "listen/endpoints", &endpoints(&self.listen)?)?;
@@ -76,13 +89,14 @@ impl SessionConfig {
         if !self.connect.is_empty() {
             set(&mut config, "connect/endpoints", &endpoints(&self.connect)?)?;
         }
-        set(&mut config, "mode", "\"peer\"")?;
+        let (mode, patience) = if self.router { ("\"client\"", "3000") } else { ("\"peer\"", "-1") };
+        set(&mut config, "mode", mode)?;
         set(&mut config, "scouting/multicast/enabled", "false")?;
         set(&mut config, "scouting/gossip/enabled", "false")?;
         set(&mut config, "listen/timeout_ms", "0")?;
         set(&mut config, "listen/exit_on_failure", "true")?;
-        set(&mut config, "connect/timeout_ms", "-1")?;
-        set(&mut config, "connect/exit_on_failure", "false")?;
+        set(&mut config, "connect/timeout_ms", patience)?;
+        set(&mut config, "connect/exit_on_failure", if self.router { "true" } else { "false" })?;
         let retry = r#"{"period_init_ms": 100, "period_max_ms": 300, "period_increase_factor": 1.5}"#;
         set(&mut config, "connect/retry", retry)?;
         set(&mut config, "transport/link/tx/lease", &self.lease.as_millis().to_string())?;
@@ -90,21 +104,60 @@ impl SessionConfig {
         set(&mut config, "transport/unicast/max_sessions", "16")?;
         set(&mut config, "transport/unicast/open_timeout", &self.open_timeout.as_millis().to_string())?;
         set(&mut config, "transport/unicast/accept_timeout", "3000")?;
+        if let Some(tls) = &self.tls {
+            set(&mut config, "transport/link/tls", &tls.settings())?;
+        }
+        if let Some(access) = &self.access {
+            set(&mut config, "access_control", &access.settings())?;
+        }
         Ok(config)
     }
+
+    /// Whether certificates, access and endpoints go together.
+    fn check_security(&self) -> Result<(), NetError> {
+        let endpoints = || self.listen.iter().chain(&self.connect);
+        match &self.tls {
+            Some(tls) => tls.check(!self.listen.is_empty(), !self.connect.is_empty())?,
+            // A zenoh configuration may bring its own.
+            None if self.zenoh_config_file.is_some() => {}
+            None => {
+                if let Some(endpoint) = endpoints().find(|endpoint| is_encrypted(endpoint)) {
+                    return Err(NetError::NoCertificate { endpoint: endpoint.clone() });
+                }
+            }
+        }
+        match (&self.access, &self.tls) {
+            (Some(_), None) => Err(NetError::AccessWithoutTls),
+            (Some(_), Some(_)) => endpoints()
+                .find(|endpoint| !is_encrypted(endpoint))
+                .map_or(Ok(()), |endpoint| Err(NetError::AccessUnencrypted { endpoint: endpoint.clone() })),
+            (None, _) => Ok(()),
+        }
+    }
+}
+
+fn is_encrypted(endpoint: &str) -> bool {
+    endpoint.starts_with("tls/") || endpoint.starts_with("quic/")
 }
 
 /// Endpoints as the JSON list that zenoh's settings take.
 fn endpoints(list: &[String]) -> Result<String, NetError> {
+    let mut out = Vec::new();
     for endpoint in list {
         let refused = |reason| NetError::Endpoint { endpoint: endpoint.clone(), reason };
-        let parsed = endpoint.parse::<EndPoint>().map_err(|error| refused(words(&error)))?;
+        let mut parsed = endpoint.parse::<EndPoint>().map_err(|error| refused(words(&error)))?;
         let protocol = parsed.protocol();
         if !PROTOCOLS.contains(&protocol.as_str()) {
             return Err(refused(format!("{protocol} is none of {}", PROTOCOLS.join(", "))));
         }
+        // Poses and states as datagrams, the rest as streams, unless the user or the peer wants it otherwise.
+        let metadata = parsed.metadata();
+        if protocol.as_str() == "quic" && metadata.get("mixed_rel").or(metadata.get("rel")).is_none() {
+            parsed.metadata_mut().insert("mixed_rel", "auto").map_err(|error| refused(words(&error)))?;
+        }
+        out.push(parsed.to_string());
     }
-    Ok(serde_json::Value::from(list).to_string())
+    Ok(serde_json::Value::from(out).to_string())
 }
 
 fn set(config: &mut Config, setting: &'static str, value: &str) -> Result<(), NetError> {
@@ -132,6 +185,28 @@ mod tests {
         assert!(error.contains("\"127.0.0.1:7447\"") && error.contains("tcp/"), "{error}");
         let error = SessionConfig::connecting(["http/127.0.0.1:7447"]).zenoh().unwrap_err().to_string();
         assert!(error.contains("http is none of tcp, udp, tls, quic"), "{error}");
+    }
+
+    #[test]
+    fn quic_is_mixed_unless_said_otherwise() {
+        for (given, taken) in [
+            ("quic/127.0.0.1:7447", "quic/127.0.0.1:7447?mixed_rel=auto"),
+            ("quic/127.0.0.1:7447?rel=0", "quic/127.0.0.1:7447?rel=0"),
+            ("quic/127.0.0.1:7447?mixed_rel=0", "quic/127.0.0.1:7447?mixed_rel=0"),
+            ("tls/127.0.0.1:7447", "tls/127.0.0.1:7447"),
+        ] {
+            assert_eq!(endpoints(&[given.to_owned()]).unwrap(), format!("[\"{taken}\"]"));
+        }
+    }
+
+    #[test]
+    fn security_needs_certificates() {
+        let config = |listen: &str| SessionConfig::listening([listen]);
+        let error = config("quic/127.0.0.1:0").zenoh().unwrap_err().to_string();
+        assert!(error.contains("quic/127.0.0.1:0") && error.contains("--tls-cert"), "{error}");
+        let open = SessionConfig { access: Some(Access::default()), ..config("tcp/127.0.0.1:0") };
+        let error = open.zenoh().unwrap_err().to_string();
+        assert!(error.contains("--allow-operator") && error.contains("--tls-ca"), "{error}");
     }
 
     #[test]

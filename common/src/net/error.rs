@@ -31,6 +31,38 @@ pub enum NetError {
         /// What zenoh says.
         reason: String,
     },
+    /// A certificate or key cannot be used.
+    #[error("certificate file {path}: {reason}", path = path.display())]
+    Certificate {
+        /// The file.
+        path: PathBuf,
+        /// Why, and what to do.
+        reason: String,
+    },
+    /// An encrypted endpoint, and no certificates.
+    #[error(
+        "endpoint {endpoint} is encrypted and needs certificates: give --tls-ca, --tls-cert and --tls-key \
+         (deploy/certificates makes some)"
+    )]
+    NoCertificate {
+        /// The endpoint.
+        endpoint: String,
+    },
+    /// Access by names, and nothing to know them by.
+    #[error(
+        "--allow-operator and --allow-observer go by the names in certificates: give --tls-ca, --tls-cert and \
+         --tls-key, and listen on quic/ or tls/"
+    )]
+    AccessWithoutTls,
+    /// Access by names, and an endpoint where nobody shows one.
+    #[error(
+        "endpoint {endpoint} is not encrypted, so nobody there has a name that --allow-operator or --allow-observer \
+         could go by: write quic/ or tls/"
+    )]
+    AccessUnencrypted {
+        /// The endpoint.
+        endpoint: String,
+    },
     /// The session does not open.
     #[error(
         "cannot open a session listening on {listen:?}, connecting to {connect:?}: is the port taken by another \
@@ -39,6 +71,16 @@ pub enum NetError {
     Open {
         /// Endpoints to listen on.
         listen: Vec<String>,
+        /// Endpoints to connect to.
+        connect: Vec<String>,
+        /// What zenoh says.
+        reason: String,
+    },
+    /// No router is there.
+    #[error(
+        "no router answers at {connect:?}: is it running, the address right, and the certificate one it takes? ({reason})"
+    )]
+    NoRouter {
         /// Endpoints to connect to.
         connect: Vec<String>,
         /// What zenoh says.
@@ -83,6 +125,23 @@ pub enum NetError {
     /// The session does not close.
     #[error("cannot close the session: {0}")]
     Close(String),
+}
+
+impl NetError {
+    /// Whether it can be mended on the command line, or in a file named there.
+    #[must_use]
+    pub const fn is_usage(&self) -> bool {
+        matches!(
+            self,
+            Self::ConfigFile { .. }
+                | Self::Endpoint { .. }
+                | Self::Setting { .. }
+                | Self::Certificate { .. }
+                | Self::NoCertificate { .. }
+                | Self::AccessWithoutTls
+                | Self::AccessUnencrypted { .. }
+        )
+    }
 }
 
 /// zenoh's words without the places in its source that it appends to them.

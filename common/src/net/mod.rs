@@ -17,6 +17,7 @@ pub mod keyboard;
 mod live;
 mod publisher;
 mod query;
+mod security;
 mod session;
 mod subscriber;
 
@@ -25,5 +26,6 @@ pub use error::NetError;
 pub use live::{LiveToken, LiveWatch};
 pub use publisher::{Publisher, Stream};
 pub use query::{MAX_ANSWER, Server};
+pub use security::{Access, Tls};
 pub use session::Session;
 pub use subscriber::{Arrival, MAX_PAYLOAD, Oversize, Subscriber};

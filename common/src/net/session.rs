@@ -19,10 +19,13 @@ impl Session {
     /// # Errors
     /// [`NetError`] naming the endpoint, file or setting; an endpoint to listen on that is taken is an error.
     pub fn open(config: &SessionConfig) -> Result<Self, NetError> {
-        let zenoh = zenoh::open(config.zenoh()?).wait().map_err(|error| NetError::Open {
-            listen: config.listen.clone(),
-            connect: config.connect.clone(),
-            reason: words(&error),
+        let zenoh = zenoh::open(config.zenoh()?).wait().map_err(|error| {
+            let (listen, connect, reason) = (config.listen.clone(), config.connect.clone(), words(&error));
+            if config.router {
+                NetError::NoRouter { connect, reason }
+            } else {
+                NetError::Open { listen, connect, reason }
+            }
         })?;
         Ok(Self { zenoh })
     }
