@@ -25,12 +25,14 @@ const DEAF: Duration = Duration::from_millis(900);
 const PARTLY_DEAF: Duration = Duration::from_secs(1);
 /// Timeout of a handshake at first, and its bounds.
 const FIRST: Duration = Duration::from_millis(300);
-const SHORTEST: Duration = Duration::from_millis(200);
+const SHORTEST: Duration = Duration::from_millis(300);
 const LONGEST: Duration = Duration::from_secs(4);
 /// Round trips that a handshake may take, with those of QUIC and some jitter.
 const ROUND_TRIPS: u32 = 6;
 /// How many handshakes in vain, or subscriptions in vain, a session is given.
-const TRIES: u32 = 4;
+const TRIES: u32 = 3;
+/// After so many sessions in vain the robot may have moved behind another link.
+const MOVED: u32 = 20;
 /// How often it is looked.
 const LOOK: Duration = Duration::from_millis(50);
 
@@ -166,14 +168,15 @@ impl Redial {
     }
 
     fn open(&mut self, now: MonoTime) -> Step {
-        let doubled = if self.timeout < LONGEST { (self.timeout * 2).min(LONGEST) } else { SHORTEST };
+        if self.failures >= MOVED {
+            self.proven = None;
+        }
         let timeout = match self.proven {
-            // The robot may have moved behind another link; mostly it is just not back yet.
-            Some(proven) if self.failures % 3 != 2 => proven,
-            Some(proven) => (proven * 2_u32.saturating_pow(self.failures / 3 + 1)).min(LONGEST),
+            // Mostly it is just not back yet; every other time twice as long, for a machine that is busy.
+            Some(proven) => (proven * (1 + self.failures % 2)).min(LONGEST),
             // On a link that loses much the short one was bad luck, so that it gets its turn again.
-            None if self.failures == 0 => self.timeout,
-            None => doubled,
+            None if self.timeout < LONGEST => (self.timeout * 2).min(LONGEST),
+            None => SHORTEST,
         };
         *self = Self { timeout, proven: self.proven, failures: self.failures, ..Self::new(now, timeout) };
         Step::Open(timeout)
@@ -365,8 +368,8 @@ mod tests {
     fn where_nobody_answers_all_timeouts_get_their_turn() {
         let mut redial = Redial::new(ms(0), FIRST);
         let found = steps(&mut redial, (50..60_000).step_by(50), |_| Signs::default());
-        assert_eq!(timeouts(&found)[..6], [600, 1200, 2400, 4000, 200, 400]);
-        assert!((1600..=1700).contains(&found[0].0), "{found:?}");
+        assert_eq!(timeouts(&found)[..6], [600, 1200, 2400, 4000, 300, 600]);
+        assert!((1200..=1300).contains(&found[0].0), "{found:?}");
     }
 
     #[test]
@@ -374,7 +377,7 @@ mod tests {
         let mut redial = Redial::new(ms(0), FIRST);
         let linked = Signs { linked: true, ..Signs::default() };
         let found = steps(&mut redial, (50..2000).step_by(50), |_| linked);
-        let opened = [Step::Subscribe, Step::Subscribe, Step::Subscribe, Step::Subscribe, Step::Open(FIRST * 2)];
+        let opened = [Step::Subscribe, Step::Subscribe, Step::Subscribe, Step::Open(FIRST * 2)];
         assert_eq!(found.iter().map(|(_, step)| *step).collect::<Vec<_>>(), opened);
         // Heard, but not all of it.
         let mut redial = Redial::new(ms(0), FIRST);
@@ -393,11 +396,12 @@ mod tests {
             round_trip: Some(Duration::from_millis(round_trip)),
         };
         assert_eq!(steps(&mut redial, (50..5000).step_by(50), |at| signs(at, 10)), []);
-        // It is cut off: the shortest again and again, and now and then a longer one.
+        // It is cut off: the shortest and twice that, for half a minute.
         let cut = Signs { linked: false, ..signs(4950, 10) };
-        let found = steps(&mut redial, (5000..20_000).step_by(50), |_| cut);
+        let found = steps(&mut redial, (5000..90_000).step_by(50), |_| cut);
         assert!((5850..=5950).contains(&found[0].0), "{found:?}");
-        assert_eq!(timeouts(&found)[..6], [200, 200, 400, 200, 200, 800]);
+        assert_eq!(timeouts(&found)[..4], [300, 600, 300, 600]);
+        assert_eq!(timeouts(&found)[19..23], [600, 1200, 2400, 4000]);
         // A satellite.
         let mut redial = Redial::new(ms(0), LONGEST);
         assert_eq!(redial.step(ms(50), &signs(50, 560)), Step::Wait);

@@ -165,7 +165,7 @@ fn outages(protocol: &str, lengths: &[f64]) {
         let outcome = outage(&pair, Duration::from_secs_f64(length));
         let Outcome { held, stale, oldest, fresh, follows } = outcome;
         let ticks = held.map_or_else(|| "no hold".to_owned(), |ticks| ticks.to_string());
-        println!("| {protocol} | {length} | {stale} | {:.0} | {ticks} | {fresh:.2} | {follows:.2} |", 1e3 * oldest);
+        println!("| {protocol} | {length:.2} | {stale} | {:.0} | {ticks} | {fresh:.2} | {follows:.2} |", 1e3 * oldest);
         assert_eq!(stale, 0, "{protocol}, {length} s: the oldest was {oldest} s old");
         if length > 2.0 * (HOLD_AFTER + PERIOD) {
             let ticks = held.unwrap();
