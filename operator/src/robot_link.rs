@@ -2,8 +2,9 @@
 //! when the robot falls silent.
 //!
 //! zenoh reconnects by itself, but not always for the better: on a link that does not resend (plain UDP) the messages that
-//! declare who publishes and subscribes what may be lost, and then the session stays up and deaf; and a session that was
-//! cut off waits longer and longer between its tries. A new session begins from nothing, at once.
+//! declare who publishes and subscribes what may be lost, and then the session stays up and deaf; and after an outage it
+//! may take ten seconds over UDP. So what the robot may have missed is subscribed to again, and a session that was cut
+//! off is replaced: a new one begins from nothing, with handshakes as short as the robot's round trip allows.
 
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -21,10 +22,9 @@ use crate::feedback::Feedback;
 /// How long the robot's joint states, a hundred a second, may be missing before the session is opened anew: almost the
 /// lease, because an outage that zenoh outlives costs nothing, and a new session costs a handshake.
 const DEAF: Duration = Duration::from_millis(900);
-/// How long what comes less often may be missing before it is subscribed to anew.
+/// How long what comes less often may be missing before it is subscribed to anew; longer from time to time.
 const PARTLY_DEAF: Duration = Duration::from_secs(1);
-/// Timeout of a handshake at first, and its bounds.
-const FIRST: Duration = Duration::from_millis(300);
+/// Bounds of the timeout of a handshake; the first is the shortest.
 const SHORTEST: Duration = Duration::from_millis(300);
 const LONGEST: Duration = Duration::from_secs(4);
 /// Round trips that a handshake may take, with those of QUIC and some jitter.
@@ -144,7 +144,8 @@ impl Redial {
                 return self.open(now);
             }
             let whole = signs.whole.map_or(self.tried, |whole| whole.max(self.tried));
-            return if now.since(whole) > PARTLY_DEAF { self.subscribe(now) } else { Step::Wait };
+            let patience = PARTLY_DEAF * (1 + self.subscriptions).min(10);
+            return if now.since(whole) > patience { self.subscribe(now) } else { Step::Wait };
         }
         if signs.linked != self.linked {
             self.linked = signs.linked;
@@ -278,7 +279,7 @@ impl RobotLink {
         own: Option<u64>,
         feedback: &Arc<Feedback>,
     ) -> Result<Self, NetError> {
-        let config = SessionConfig { open_timeout: FIRST, ..config };
+        let config = SessionConfig { open_timeout: SHORTEST, ..config };
         let first = Connected::open(&config, keys, own, feedback)?;
         let shared = Arc::new(Shared {
             config,
@@ -291,7 +292,7 @@ impl RobotLink {
         let stop = Arc::new(AtomicBool::new(false));
         let (own, stopped) = (Arc::clone(&shared), Arc::clone(&stop));
         let watch = move || {
-            let mut redial = Redial::new(now(), FIRST);
+            let mut redial = Redial::new(now(), SHORTEST);
             while !stopped.load(Ordering::Acquire) {
                 std::thread::park_timeout(LOOK);
                 let step = redial.step(now(), &own.signs());
@@ -366,7 +367,7 @@ mod tests {
 
     #[test]
     fn where_nobody_answers_all_timeouts_get_their_turn() {
-        let mut redial = Redial::new(ms(0), FIRST);
+        let mut redial = Redial::new(ms(0), SHORTEST);
         let found = steps(&mut redial, (50..60_000).step_by(50), |_| Signs::default());
         assert_eq!(timeouts(&found)[..6], [600, 1200, 2400, 4000, 300, 600]);
         assert!((1200..=1300).contains(&found[0].0), "{found:?}");
@@ -374,21 +375,21 @@ mod tests {
 
     #[test]
     fn a_robot_that_does_not_know_of_the_subscription_is_told_again() {
-        let mut redial = Redial::new(ms(0), FIRST);
+        let mut redial = Redial::new(ms(0), SHORTEST);
         let linked = Signs { linked: true, ..Signs::default() };
         let found = steps(&mut redial, (50..2000).step_by(50), |_| linked);
-        let opened = [Step::Subscribe, Step::Subscribe, Step::Subscribe, Step::Open(FIRST * 2)];
+        let opened = [Step::Subscribe, Step::Subscribe, Step::Subscribe, Step::Open(SHORTEST * 2)];
         assert_eq!(found.iter().map(|(_, step)| *step).collect::<Vec<_>>(), opened);
         // Heard, but not all of it.
-        let mut redial = Redial::new(ms(0), FIRST);
+        let mut redial = Redial::new(ms(0), SHORTEST);
         let found =
             steps(&mut redial, (50..3500).step_by(50), |at| Signs { heard: Some(ms(at)), linked: true, ..linked });
-        assert_eq!(timeouts(&found), [0, 0, 0]);
+        assert_eq!(timeouts(&found), [0, 0]);
     }
 
     #[test]
     fn a_robot_that_was_heard_gets_the_timeout_that_suits_it() {
-        let mut redial = Redial::new(ms(0), FIRST);
+        let mut redial = Redial::new(ms(0), SHORTEST);
         let signs = |at: u64, round_trip: u64| Signs {
             linked: true,
             heard: Some(ms(at)),

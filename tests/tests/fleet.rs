@@ -14,6 +14,9 @@ use teleop_tests::process::{Process, Robot, run};
 /// Clock ticks per second of /proc, the same on all Linux machines that we build for.
 const USER_HZ: f64 = 100.0;
 
+/// Links of one session at most: more robots are listed by turns, or over a router.
+const MOST_LINKS: usize = 16;
+
 /// CPU time of a process so far, s.
 fn cpu(process: &Process) -> f64 {
     let stat = std::fs::read_to_string(format!("/proc/{}/stat", process.id())).unwrap();
@@ -34,12 +37,15 @@ fn fleet(count: usize, time: Duration) -> Vec<serde_json::Value> {
         .enumerate()
         .map(|(index, robot)| Process::operator(robot.endpoint(), "wave", &["--name", &name(index), "--rate", "100"]))
         .collect();
-    let endpoints: Vec<&str> = robots.iter().flat_map(|robot| ["--connect", robot.endpoint()]).collect();
     let list = || {
-        let output = run("operator", &[&["list", "--json", "--time", "1"], endpoints.as_slice()].concat());
-        assert_eq!(output.status.code(), Some(0), "{}", String::from_utf8_lossy(&output.stderr));
-        let lines = String::from_utf8(output.stdout).unwrap();
-        lines.lines().map(|line| serde_json::from_str(line).unwrap()).collect::<Vec<serde_json::Value>>()
+        let ask = |robots: &[Robot]| {
+            let endpoints: Vec<&str> = robots.iter().flat_map(|robot| ["--connect", robot.endpoint()]).collect();
+            let output = run("operator", &[&["list", "--json", "--time", "1"], endpoints.as_slice()].concat());
+            assert_eq!(output.status.code(), Some(0), "{}", String::from_utf8_lossy(&output.stderr));
+            let lines = String::from_utf8(output.stdout).unwrap();
+            lines.lines().map(|line| serde_json::from_str(line).unwrap()).collect::<Vec<serde_json::Value>>()
+        };
+        robots.chunks(MOST_LINKS).flat_map(ask).collect::<Vec<_>>()
     };
     let mut rows = Vec::new();
     eventually("all robots are listed and follow", || {

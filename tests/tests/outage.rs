@@ -3,6 +3,9 @@
 //! The operator is behind a relay; the robot is watched over another, clean link. All clocks are of this machine, and
 //! what is measured are the robot's own stamps and ticks. The tables are printed with `--nocapture`; the long
 //! measurements are `--ignored`.
+//!
+//! The relay passes on what it held up as soon as it may, and takes new connections in the dark; a real TCP waits for its
+//! next retransmission, up to as long again as the outage was, or for its next try to connect.
 
 #![allow(clippy::unwrap_used, reason = "helpers of tests")]
 
