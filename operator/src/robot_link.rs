@@ -2,8 +2,9 @@
 //! when the robot falls silent.
 //!
 //! zenoh reconnects by itself, but not always for the better: on a link that does not resend (plain UDP) the messages that
-//! declare who publishes and subscribes what may be lost, and then the session stays up and deaf; and a session that was
-//! cut off waits longer and longer between its tries. A new session begins from nothing, at once.
+//! declare who publishes and subscribes what may be lost, and then the session stays up and deaf; and after an outage it
+//! may take ten seconds over UDP. So what the robot may have missed is subscribed to again, and a session that was cut
+//! off is replaced: a new one begins from nothing, with handshakes as short as the robot's round trip allows.
 
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -12,20 +13,27 @@ use std::time::Duration;
 
 use teleop_common::key::Keys;
 use teleop_common::net::clock::now;
-use teleop_common::net::{LiveToken, NetError, Publisher, Session, SessionConfig, Stream, Subscriber};
+use teleop_common::net::{LiveToken, NetError, Publisher, RETRY, Session, SessionConfig, Stream, Subscriber};
 use teleop_common::time::MonoTime;
 use teleop_common::wire::{ControlMessage, PoseMessage};
 
 use crate::feedback::Feedback;
 
-/// How long the robot's joint states, a hundred a second, may be missing before the session is opened anew.
-const DEAF: Duration = Duration::from_millis(600);
-/// The same of what comes less often, or may be lost more often.
+/// How long the robot's joint states, a hundred a second, may be missing before the session is opened anew: almost the
+/// lease, because an outage that zenoh outlives costs nothing, and a new session costs a handshake.
+const DEAF: Duration = Duration::from_millis(900);
+/// How long what comes less often may be missing before it is subscribed to anew; longer from time to time. Never by chance
+/// alone: where much gets lost, a new subscription may get lost as well, and with it what was heard before.
 const PARTLY_DEAF: Duration = Duration::from_secs(3);
-/// How many times a handshake's timeout a new session is given.
-const HANDSHAKES: u32 = 3;
-/// Longest timeout of a handshake that is tried.
-const LONGEST: Duration = Duration::from_secs(5);
+/// Bounds of the timeout of a handshake; the first is the shortest.
+const SHORTEST: Duration = Duration::from_millis(300);
+const LONGEST: Duration = Duration::from_secs(4);
+/// Round trips that a handshake may take, with those of QUIC and some jitter.
+const ROUND_TRIPS: u32 = 6;
+/// How many handshakes in vain, or subscriptions in vain, a session is given.
+const TRIES: u32 = 3;
+/// After so many sessions in vain the robot may have moved behind another link.
+const MOVED: u32 = 20;
 /// How often it is looked.
 const LOOK: Duration = Duration::from_millis(50);
 
@@ -35,7 +43,7 @@ struct Connected {
     poses: Publisher,
     control: Publisher,
     _token: Option<LiveToken>,
-    _subscribers: [Subscriber; 3],
+    subscribers: Option<[Subscriber; 3]>,
 }
 
 impl Connected {
@@ -45,9 +53,17 @@ impl Connected {
             poses: session.publisher(&keys.pose(), Stream::Command)?,
             control: session.publisher(&keys.control(), Stream::Slow)?,
             _token: own.map(|epoch| session.live_token(&keys.live_operator(epoch))).transpose()?,
-            _subscribers: hear(&session, keys, feedback)?,
+            subscribers: Some(hear(&session, keys, feedback)?),
             session,
         })
+    }
+
+    /// Subscribes anew: the robot may have missed it.
+    fn hear_again(&mut self, keys: &Keys, feedback: &Arc<Feedback>) -> Result<(), NetError> {
+        // The old ones go first, so that the robot is told of new ones.
+        drop(self.subscribers.take());
+        self.subscribers = Some(hear(&self.session, keys, feedback)?);
+        Ok(())
     }
 }
 
@@ -77,51 +93,128 @@ struct Shared {
     opened: AtomicU64,
 }
 
+/// What is to be done about a robot that is not heard.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Step {
+    Wait,
+    /// Subscribe anew, on the same session.
+    Subscribe,
+    /// Open the session anew, with this timeout of a handshake.
+    Open(Duration),
+}
+
+/// What is known of the robot.
+#[derive(Clone, Copy, Debug, Default)]
+struct Signs {
+    /// The session has a link.
+    linked: bool,
+    /// When its joint states came last.
+    heard: Option<MonoTime>,
+    /// When all that it publishes did.
+    whole: Option<MonoTime>,
+    /// The round trip.
+    round_trip: Option<Duration>,
+}
+
 /// When the session is to be opened anew, and with which timeout. No clock, no thread.
 #[derive(Clone, Debug)]
 struct Redial {
     opened: MonoTime,
+    /// When there was last reason for patience: a link came up, or a subscription was made.
+    tried: MonoTime,
+    linked: bool,
+    subscriptions: u32,
     /// Of a handshake: short finds a link that is back sooner, long gets through where round trips are long.
     timeout: Duration,
-    /// The one with which the robot was heard.
+    /// The one that suits a robot that was heard.
     proven: Option<Duration>,
     failures: u32,
 }
 
 impl Redial {
     const fn new(now: MonoTime, timeout: Duration) -> Self {
-        Self { opened: now, timeout, proven: None, failures: 0 }
+        Self { opened: now, tried: now, linked: false, subscriptions: 0, timeout, proven: None, failures: 0 }
     }
 
-    /// The timeout of the session that is to be opened now, if one is; `heard` is when the robot's joint states came
-    /// last, `whole` when all that it publishes did.
-    fn step(&mut self, now: MonoTime, heard: Option<MonoTime>, whole: Option<MonoTime>) -> Option<Duration> {
-        if let Some(heard) = heard.filter(|heard| *heard >= self.opened) {
-            (self.proven, self.failures) = (Some(self.timeout), 0);
-            let deaf = now.since(heard) > DEAF;
-            let partly = now.since(whole.unwrap_or(self.opened).max(self.opened)) > PARTLY_DEAF;
-            if !deaf && !partly {
-                return None;
+    fn step(&mut self, now: MonoTime, signs: &Signs) -> Step {
+        if let Some(heard) = signs.heard.filter(|heard| *heard >= self.opened) {
+            let suits = |round_trip: Duration| (round_trip * ROUND_TRIPS).clamp(SHORTEST, LONGEST);
+            self.proven = Some(signs.round_trip.map_or(self.timeout, suits));
+            self.failures = 0;
+            if now.since(heard) > DEAF {
+                return self.open(now);
             }
-        } else {
-            if now.since(self.opened) <= self.timeout * HANDSHAKES {
-                return None;
-            }
-            self.failures += 1;
-            self.timeout = match self.proven {
-                // The robot may have moved behind another link; mostly it is just not back yet.
-                Some(proven) if self.failures % 4 != 0 => proven,
-                _ => (self.timeout * 2).min(LONGEST),
-            };
+            let whole = signs.whole.map_or(self.tried, |whole| whole.max(self.tried));
+            let patience = PARTLY_DEAF * (1 + self.subscriptions).min(10);
+            return if now.since(whole) > patience { self.subscribe(now) } else { Step::Wait };
         }
-        self.opened = now;
-        Some(self.timeout)
+        if signs.linked != self.linked {
+            self.linked = signs.linked;
+            self.tried = now;
+        }
+        let patience = if self.linked { self.timeout } else { (self.timeout + RETRY) * TRIES };
+        if now.since(self.tried) <= patience {
+            Step::Wait
+        } else if self.linked && self.subscriptions < TRIES {
+            self.subscribe(now)
+        } else {
+            self.failures += 1;
+            self.open(now)
+        }
+    }
+
+    fn subscribe(&mut self, now: MonoTime) -> Step {
+        self.tried = now;
+        self.subscriptions += 1;
+        Step::Subscribe
+    }
+
+    fn open(&mut self, now: MonoTime) -> Step {
+        if self.failures >= MOVED {
+            self.proven = None;
+        }
+        let timeout = match self.proven {
+            // Mostly it is just not back yet; every other time twice as long, for a machine that is busy.
+            Some(proven) => (proven * (1 + self.failures % 2)).min(LONGEST),
+            // On a link that loses much the short one was bad luck, so that it gets its turn again.
+            None if self.timeout < LONGEST => (self.timeout * 2).min(LONGEST),
+            None => SHORTEST,
+        };
+        *self = Self { timeout, proven: self.proven, failures: self.failures, ..Self::new(now, timeout) };
+        Step::Open(timeout)
     }
 }
 
 impl Shared {
     fn lock(&self) -> MutexGuard<'_, Option<Connected>> {
         self.connected.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn signs(&self) -> Signs {
+        let session = self.lock().as_ref().map(|connected| connected.session.clone());
+        let (heard, whole) = self.feedback.last_heard();
+        let trips = self.feedback.round_trips();
+        Signs {
+            linked: session.is_some_and(|session| session.peers() > 0),
+            heard,
+            whole,
+            round_trip: (trips.count() > 0).then(|| trips.p50()),
+        }
+    }
+
+    fn take(&self, step: Step) {
+        match step {
+            Step::Wait => {}
+            Step::Open(timeout) => self.reopen(timeout),
+            Step::Subscribe => {
+                // Not under the lock, where the next pose would wait for it.
+                let Some(mut connected) = self.lock().take() else { return };
+                if let Err(error) = connected.hear_again(&self.keys, &self.feedback) {
+                    tracing::warn!("cannot subscribe anew: {error}");
+                }
+                *self.lock() = Some(connected);
+            }
+        }
     }
 
     /// A session in place of the one that is.
@@ -187,6 +280,7 @@ impl RobotLink {
         own: Option<u64>,
         feedback: &Arc<Feedback>,
     ) -> Result<Self, NetError> {
+        let config = SessionConfig { open_timeout: SHORTEST, ..config };
         let first = Connected::open(&config, keys, own, feedback)?;
         let shared = Arc::new(Shared {
             config,
@@ -199,14 +293,12 @@ impl RobotLink {
         let stop = Arc::new(AtomicBool::new(false));
         let (own, stopped) = (Arc::clone(&shared), Arc::clone(&stop));
         let watch = move || {
-            let mut redial = Redial::new(now(), own.config.open_timeout);
+            let mut redial = Redial::new(now(), SHORTEST);
             while !stopped.load(Ordering::Acquire) {
                 std::thread::park_timeout(LOOK);
-                let (heard, whole) = own.feedback.last_heard();
-                if !stopped.load(Ordering::Acquire)
-                    && let Some(timeout) = redial.step(now(), heard, whole)
-                {
-                    own.reopen(timeout);
+                let step = redial.step(now(), &own.signs());
+                if !stopped.load(Ordering::Acquire) {
+                    own.take(step);
                 }
             }
         };
@@ -260,27 +352,61 @@ impl Drop for RobotLink {
 mod tests {
     use super::*;
 
+    const fn ms(ms: u64) -> MonoTime {
+        MonoTime(ms * 1_000_000)
+    }
+
+    /// All steps but waiting, with their times, ms.
+    fn steps(redial: &mut Redial, times: impl Iterator<Item = u64>, signs: impl Fn(u64) -> Signs) -> Vec<(u64, Step)> {
+        times.map(|at| (at, redial.step(ms(at), &signs(at)))).filter(|(_, step)| *step != Step::Wait).collect()
+    }
+
+    fn timeouts(steps: &[(u64, Step)]) -> Vec<u128> {
+        let timeout = |step: &Step| if let Step::Open(timeout) = step { timeout.as_millis() } else { 0 };
+        steps.iter().map(|(_, step)| timeout(step)).collect()
+    }
+
     #[test]
-    fn a_session_is_given_as_long_as_its_link_needs() {
-        let ms = |ms: u64| MonoTime(ms * 1_000_000);
-        let short = Duration::from_millis(600);
-        // Nobody answers: longer and longer.
-        let mut redial = Redial::new(ms(0), short);
-        assert_eq!(redial.step(ms(1800), None, None), None);
-        assert_eq!(redial.step(ms(1801), None, None), Some(short * 2));
-        assert_eq!(redial.step(ms(5400), None, None), None);
-        assert_eq!(redial.step(ms(5402), None, None), Some(short * 4));
-        // Then the robot is heard, and all is well as long as everything comes.
-        for at in (6000..20_000).step_by(50) {
-            assert_eq!(redial.step(ms(at), Some(ms(at)), Some(ms(at - 200))), None);
-        }
-        assert_eq!(redial.step(ms(20_500), Some(ms(19_950)), Some(ms(19_950))), None);
-        // It is cut off: the same again and again, so that it is back soon.
-        assert_eq!(redial.step(ms(20_600), Some(ms(19_950)), Some(ms(19_950))), Some(short * 4));
-        assert_eq!(redial.step(ms(27_900), Some(ms(19_950)), Some(ms(19_950))), Some(short * 4));
-        // Heard again, but not all of it.
-        let mut redial = Redial::new(ms(0), short);
-        assert_eq!(redial.step(ms(2900), Some(ms(2900)), None), None);
-        assert_eq!(redial.step(ms(3001), Some(ms(3000)), None), Some(short));
+    fn where_nobody_answers_all_timeouts_get_their_turn() {
+        let mut redial = Redial::new(ms(0), SHORTEST);
+        let found = steps(&mut redial, (50..60_000).step_by(50), |_| Signs::default());
+        assert_eq!(timeouts(&found)[..6], [600, 1200, 2400, 4000, 300, 600]);
+        assert!((1200..=1300).contains(&found[0].0), "{found:?}");
+    }
+
+    #[test]
+    fn a_robot_that_does_not_know_of_the_subscription_is_told_again() {
+        let mut redial = Redial::new(ms(0), SHORTEST);
+        let linked = Signs { linked: true, ..Signs::default() };
+        let found = steps(&mut redial, (50..2000).step_by(50), |_| linked);
+        let opened = [Step::Subscribe, Step::Subscribe, Step::Subscribe, Step::Open(SHORTEST * 2)];
+        assert_eq!(found.iter().map(|(_, step)| *step).collect::<Vec<_>>(), opened);
+        // Heard, but not all of it.
+        let mut redial = Redial::new(ms(0), SHORTEST);
+        let found =
+            steps(&mut redial, (50..9500).step_by(50), |at| Signs { heard: Some(ms(at)), linked: true, ..linked });
+        assert_eq!(timeouts(&found), [0, 0]);
+    }
+
+    #[test]
+    fn a_robot_that_was_heard_gets_the_timeout_that_suits_it() {
+        let mut redial = Redial::new(ms(0), SHORTEST);
+        let signs = |at: u64, round_trip: u64| Signs {
+            linked: true,
+            heard: Some(ms(at)),
+            whole: Some(ms(at)),
+            round_trip: Some(Duration::from_millis(round_trip)),
+        };
+        assert_eq!(steps(&mut redial, (50..5000).step_by(50), |at| signs(at, 10)), []);
+        // It is cut off: the shortest and twice that, for half a minute.
+        let cut = Signs { linked: false, ..signs(4950, 10) };
+        let found = steps(&mut redial, (5000..90_000).step_by(50), |_| cut);
+        assert!((5850..=5950).contains(&found[0].0), "{found:?}");
+        assert_eq!(timeouts(&found)[..4], [300, 600, 300, 600]);
+        assert_eq!(timeouts(&found)[19..23], [600, 1200, 2400, 4000]);
+        // A satellite.
+        let mut redial = Redial::new(ms(0), LONGEST);
+        assert_eq!(redial.step(ms(50), &signs(50, 560)), Step::Wait);
+        assert_eq!(redial.step(ms(1000), &signs(50, 560)), Step::Open(Duration::from_millis(3360)));
     }
 }

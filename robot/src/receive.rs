@@ -182,7 +182,7 @@ impl Receiver {
 }
 
 /// How long nothing may come before the subscription is declared anew.
-const RENEW_EVERY: Duration = Duration::from_secs(1);
+const RENEW_EVERY: Duration = Duration::from_millis(500);
 
 /// The subscriptions that feed a [`Receiver`].
 ///

@@ -52,6 +52,10 @@ pub enum Signal {
     Stop,
     /// SIGCONT
     Cont,
+    /// SIGUSR1
+    Usr1,
+    /// SIGUSR2
+    Usr2,
 }
 
 /// A child process; dropping it kills it.

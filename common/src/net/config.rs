@@ -14,6 +14,9 @@ pub const DEFAULT_LEASE: Duration = Duration::from_millis(1000);
 /// Time for the handshake of a link: several round trips within a continent.
 pub const DEFAULT_OPEN_TIMEOUT: Duration = Duration::from_millis(600);
 
+/// Time between two tries to connect.
+pub const RETRY: Duration = Duration::from_millis(100);
+
 /// The link protocols that are built in.
 const PROTOCOLS: [&str; 4] = ["tcp", "udp", "tls", "quic"];
 
@@ -26,7 +29,7 @@ pub struct SessionConfig {
     /// Endpoints to listen on, such as `tcp/127.0.0.1:7447`; port 0 lets the system choose, see
     /// [`super::Session::locators`]. None: nobody can connect to this process.
     pub listen: Vec<String>,
-    /// Endpoints to connect to; tried for ever, every 0.1 to 0.3 s, also after a connection was lost.
+    /// Endpoints to connect to; tried for ever, [`RETRY`] apart, also after a connection was lost.
     pub connect: Vec<String>,
     /// The endpoints to connect to are routers. Between two peers of one router zenoh passes nothing on, because it
     /// expects them to reach each other; so of robot and operator one, the operator, has to be a client. A router that
@@ -97,8 +100,9 @@ impl SessionConfig {
         set(&mut config, "listen/exit_on_failure", "true")?;
         set(&mut config, "connect/timeout_ms", patience)?;
         set(&mut config, "connect/exit_on_failure", if self.router { "true" } else { "false" })?;
-        let retry = r#"{"period_init_ms": 100, "period_max_ms": 300, "period_increase_factor": 1.5}"#;
-        set(&mut config, "connect/retry", retry)?;
+        let every = RETRY.as_millis();
+        let retry = format!(r#"{{"period_init_ms": {every}, "period_max_ms": {every}, "period_increase_factor": 1}}"#);
+        set(&mut config, "connect/retry", &retry)?;
         set(&mut config, "transport/link/tx/lease", &self.lease.as_millis().to_string())?;
         set(&mut config, "transport/link/rx/max_message_size", &MAX_MESSAGE_SIZE.to_string())?;
         set(&mut config, "transport/unicast/max_sessions", "16")?;

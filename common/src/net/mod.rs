@@ -21,7 +21,7 @@ mod security;
 mod session;
 mod subscriber;
 
-pub use config::{DEFAULT_LEASE, DEFAULT_OPEN_TIMEOUT, SessionConfig};
+pub use config::{DEFAULT_LEASE, DEFAULT_OPEN_TIMEOUT, RETRY, SessionConfig};
 pub use error::NetError;
 pub use live::{LiveToken, LiveWatch};
 pub use publisher::{Publisher, Stream};
