@@ -155,14 +155,14 @@ fn a_damped_prediction_is_better_than_holding_and_a_linear_one_is_not() {
         let time = gap as f64 / 30.0;
         let ahead = if tau > 0.0 { tau * (1.0 - (-time / tau).exp()) } else { 0.0 };
         let (mut sum, mut count) = (0.0, 0.0);
-        for frame in 1..motion.len() - gap {
-            for joint in 0..20 {
-                let velocity = (motion[frame][joint] - motion[frame - 1][joint]) * 30.0;
-                sum += (motion[frame][joint] + velocity * ahead - motion[frame + gap][joint]).powi(2);
+        for (frames, later) in motion.windows(2).zip(&motion[1 + gap..]) {
+            for ((before, now), later) in frames[0].iter().zip(&frames[1]).zip(later) {
+                let velocity = (now - before) * 30.0;
+                sum += (now + velocity * ahead - later).powi(2);
                 count += 1.0;
             }
         }
-        1e3 * (sum / count as f64).sqrt()
+        1e3 * (sum / count).sqrt()
     };
     println!("gap ms | hold | tau 10 ms | 20 ms | 40 ms | 80 ms | linear  (rms error, mrad)");
     for gap in 1..=3 {

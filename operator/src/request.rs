@@ -97,7 +97,6 @@ impl Requests {
     }
 
     /// A way to wish from another thread; never waits.
-    #[must_use]
     pub fn wisher(&self) -> impl Fn(Wish) + Send + 'static {
         let wishes = self.wishes.clone();
         move |wish| {

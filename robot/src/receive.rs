@@ -87,20 +87,14 @@ impl Receiver {
     pub fn on_control(&mut self, arrival: Arrival<'_>) {
         let Ok(message) = arrival.decode::<ControlMessage>() else { return };
         let latch: &StopLatch = &self.shared.latch;
+        let meant = message.robot == self.epoch && self.lease.holder(arrival.at) == Some(message.header.epoch);
         match message.request() {
             // From anybody and however old: to hold still is never wrong.
-            Some(Request::Stop) => {
-                if latch.stop() {
-                    tracing::warn!("stop: asked for over the network");
-                }
+            Some(Request::Stop) if latch.stop() => tracing::warn!("stop: asked for over the network"),
+            Some(Request::Reset { stop }) if meant && latch.reset(stop) => {
+                tracing::warn!("stop {stop}: reset by the operator {:?}", self.operator.as_str());
             }
-            Some(Request::Reset { stop }) => {
-                let holds = self.lease.holder(arrival.at) == Some(message.header.epoch);
-                if holds && message.robot == self.epoch && latch.reset(stop) {
-                    tracing::warn!("stop {stop}: reset by the operator {:?}", self.operator.as_str());
-                }
-            }
-            None => {}
+            _ => {}
         }
     }
 

@@ -206,7 +206,8 @@ fn two_operators_that_fight_do_no_harm() {
     // Whoever takes it, the hand does not go on with another's poses: it stops first.
     for pair in states.windows(2) {
         let changed = pair[0].pose_epoch != pair[1].pose_epoch && pair[1].tick <= pair[0].tick + 4;
-        assert!(!changed || !(follows(&pair[0]) && pair[1].mode() == Some(Mode::Engaged)), "tick {}", pair[1].tick);
+        let goes_on = changed && follows(&pair[0]) && pair[1].mode() == Some(Mode::Engaged);
+        assert!(!goes_on, "tick {}", pair[1].tick);
     }
 }
 

@@ -271,7 +271,7 @@ fn judge(
         velocity[slot] = moving;
     }
     // Not in every tick: that would be most of the work, and the guard's own tests do it.
-    if record.tick % 5 == 0 {
+    if record.tick.is_multiple_of(5) {
         out.violations += u64::from(guard.least_gap(hand, &record.command.q) < -MAX_PENETRATION - 1e-9);
     }
     out.violations += u64::from(record.mode == Mode::Faulted);

@@ -193,7 +193,7 @@ mod tests {
             while self.now < end {
                 self.now += 2;
                 if let Some((epoch, clutch)) = operator
-                    && self.now % 10 == 0
+                    && self.now.is_multiple_of(10)
                 {
                     let at = MonoTime(self.now * MS);
                     let sequence = self.heard.map_or(1, |heard| heard.sequence + 1);

@@ -156,7 +156,7 @@ fn endpoints(list: &[String]) -> Result<String, NetError> {
         }
         // Poses and states as datagrams, the rest as streams, unless the user or the peer wants it otherwise.
         let metadata = parsed.metadata();
-        if protocol.as_str() == "quic" && metadata.get("mixed_rel").or(metadata.get("rel")).is_none() {
+        if protocol.as_str() == "quic" && metadata.get("mixed_rel").is_none() && metadata.get("rel").is_none() {
             parsed.metadata_mut().insert("mixed_rel", "auto").map_err(|error| refused(words(&error)))?;
         }
         out.push(parsed.to_string());

@@ -19,6 +19,9 @@ impl Session {
     /// # Errors
     /// [`NetError`] naming the endpoint, file or setting; an endpoint to listen on that is taken is an error.
     pub fn open(config: &SessionConfig) -> Result<Self, NetError> {
+        if config.listen.iter().chain(&config.connect).any(|endpoint| endpoint.starts_with("tls/")) {
+            tracing::warn!("a tls/ link of zenoh 1.10 can abort the process when its peer goes away: prefer quic/");
+        }
         let zenoh = zenoh::open(config.zenoh()?).wait().map_err(|error| {
             let (listen, connect, reason) = (config.listen.clone(), config.connect.clone(), words(&error));
             if config.router {

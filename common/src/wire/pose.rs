@@ -86,7 +86,7 @@ impl PoseMessage {
             phalanges: single(pose.geometry.phalanges),
             tuning: pose.tuning.map_or_else(TuningMessage::default, Into::into),
             clutch: intent.clutch.0,
-            request: u8::from(intent.takeover) * TAKEOVER | u8::from(intent.leaving) * LEAVING,
+            request: (u8::from(intent.takeover) * TAKEOVER) | (u8::from(intent.leaving) * LEAVING),
             operator: intent.operator,
         }
     }
