@@ -4,7 +4,7 @@ A hand cannot both copy a fast, noisy human and move smoothly. This asks how muc
 joint paths x of a recording's frames, and prints two Markdown tables.
 
 1. Smoothness. The least mean |x[t+1] - 2 x[t] + x[t-1]| of a path that stays within eps of the given one, joint by
-   joint and frame by frame.
+   joint and frame by frame; and of one that besides is exactly on it where the human pinches (see 2).
 2. Contact within the limits. The least eps with which a path exists that obeys the hand's speed and acceleration, stays
    within eps of the combined mapping's in every frame, and in the frames in which the human pinches is exactly on it
    with the joints of thumb and pinching finger, which is where the tips touch.
@@ -57,17 +57,22 @@ def main() -> None:
     print(f"`{arguments.recording.name}`, {len(table)} frames at {1 / dt:.3g} Hz. Least mean second difference, mrad:\n")
     row("within eps of", "lag, frames", "eps 0 (the path)", *(f"eps {eps} rad" for eps in TOLERANCES))
     row(*["---"] * (3 + len(TOLERANCES)))
-    for name, path in (("joint mapping, unfiltered", measured), ("combined mapping", combined)):
+    nowhere = np.zeros_like(pinched)
+    for name, path, exact in (
+        ("joint mapping, unfiltered", measured, nowhere),
+        ("combined mapping", combined, nowhere),
+        ("combined mapping, exact in the pinches", combined, pinched),
+    ):
         for lag in (0, 1):
             own = [f"{1e3 * np.abs(np.diff(path, n=2, axis=0)).mean():.1f}"] if lag == 0 else [""]
-            row(name, lag, *own, *(f"{1e3 * smoothest(path, eps, lag):.1f}" for eps in TOLERANCES))
+            row(name, lag, *own, *(f"{1e3 * smoothest(path, exact, eps, lag):.1f}" for eps in TOLERANCES))
 
     frames = int(pinched.any(axis=1).sum())
     print(f"\nLeast eps within {SPEED:g} rad/s and {ACCELERATION:g} rad/s^2, rad; the human pinches in {frames} frames:\n")
     row("within eps of the combined mapping, lag, frames", "in no frame exact", "exact in the pinches")
     row(*["---"] * 3)
     for lag in (0, 1):
-        found = [nearest(combined, exact, dt, lag) for exact in (np.zeros_like(pinched), pinched)]
+        found = [nearest(combined, exact, dt, lag) for exact in (nowhere, pinched)]
         row(lag, *("impossible" if error is None else f"{error:.2f}" for error in found))
 
 
@@ -112,8 +117,8 @@ def difference(frames: int, order: int) -> csr_array:
     return csr_array(sum(weight * eye_array(rows, frames, k=shift) for shift, weight in enumerate(weights)))
 
 
-def smoothest(path: np.ndarray, eps: float, lag: int) -> float:
-    """The least mean second difference within `eps` of `path` (frames, joints), rad."""
+def smoothest(path: np.ndarray, exact: np.ndarray, eps: float, lag: int) -> float:
+    """The least mean second difference within `eps` of `path`, and on it where `exact` (both (frames, joints)), rad."""
     frames, joints = path.shape
     second = difference(frames, 2)
     count = second.shape[0]
@@ -123,7 +128,9 @@ def smoothest(path: np.ndarray, eps: float, lag: int) -> float:
     total = 0.0
     for joint in range(joints):
         low, high = band(path[:, joint], lag)
-        ranges = np.concatenate([np.column_stack([low - eps, high + eps]), np.tile([0.0, np.inf], (count, 1))])
+        own = exact[:, joint]
+        low, high = np.where(own, path[:, joint], low - eps), np.where(own, path[:, joint], high + eps)
+        ranges = np.concatenate([np.column_stack([low, high]), np.tile([0.0, np.inf], (count, 1))])
         total += solve(cost, bounding, np.zeros(2 * count), ranges).fun
     return total / (count * joints)
 
