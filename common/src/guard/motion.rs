@@ -22,7 +22,7 @@ use crate::hand::{
     between_segments,
 };
 
-/// No command brings two bodies further into each other, m. Two fingertips: or [`TIP_SLACK`] more than they may.
+/// No command brings two bodies further into each other, m. Two fingertips: or `TIP_SLACK` more than they may.
 pub const MAX_PENETRATION: f64 = 0.001;
 /// Bodies that start further inside each other than that by this (m) are left alone until they are not: nothing says
 /// which way is out.
