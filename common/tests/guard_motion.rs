@@ -1,9 +1,9 @@
 //! No command brings the hand into itself, whatever the targets are.
 #![allow(clippy::unwrap_used, clippy::print_stdout, missing_docs, reason = "tests")]
 
+mod master_support;
+
 use std::collections::BTreeMap;
-use std::fs::File;
-use std::io::BufReader;
 
 use nalgebra::{Isometry3, Point3, Vector3};
 use proptest::prelude::*;
@@ -11,11 +11,7 @@ use teleop_common::conditioner::Conditioner;
 use teleop_common::guard::{Intervention, MAX_PENETRATION, MotionGuard, TipGuard};
 use teleop_common::hand::{FingerChain, HandModel, HandSide, JointVector, MAX_FINGERS, TipFrame};
 use teleop_common::mapping::{MappingParams, Retargeter};
-use teleop_common::master::{
-    Calibrator, Filter, FilterSettings, Fitter, Gesture, Keypoints, MasterGeometry, MasterPose,
-};
-use teleop_common::recording::{FrameData, LastLine, RecordingReader};
-use teleop_common::testing::shared_data;
+use teleop_common::master::{Calibrator, Filter, FilterSettings, Fitter, Gesture, MasterGeometry, MasterPose};
 
 const PERIOD: f64 = 1.0 / 333.0;
 const ALLOWANCE: f64 = 0.0005;
@@ -382,14 +378,7 @@ fn gestures_are_followed_as_they_were_but_without_collisions() {
 
 #[test]
 fn a_recorded_hand_is_followed_where_it_does_not_collide() {
-    let Some(path) = shared_data("human_hand_right.csv") else { return };
-    let reader = RecordingReader::new(BufReader::new(File::open(path).unwrap()), LastLine::Whole).unwrap();
-    let keypoints: Vec<Keypoints> = reader
-        .filter_map(|frame| match frame.unwrap().data {
-            FrameData::Keypoints(keypoints) => Some(keypoints),
-            FrameData::Joints(_) => None,
-        })
-        .collect();
+    let Some(keypoints) = master_support::recorded() else { return };
     let mut calibrator = Calibrator::default();
     keypoints.iter().for_each(|frame| calibrator.push(frame));
     let mut calibration = calibrator.finish().unwrap();

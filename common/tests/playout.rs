@@ -5,6 +5,7 @@ mod master_support;
 
 use std::time::Duration;
 
+use master_support::Noise;
 use teleop_common::master::{Calibrator, Filter, FilterSettings, Fitter, MasterGeometry, MasterPose};
 use teleop_common::playout::{Playout, PlayoutMode, PlayoutParams};
 use teleop_common::time::MonoTime;
@@ -22,16 +23,6 @@ fn motion(t: f64) -> f64 {
     0.7 * (2.0 * t).sin() + 0.1 * (9.0 * t).sin()
 }
 
-/// A small generator of numbers in 0..1.
-struct Dice(u64);
-
-impl Dice {
-    fn roll(&mut self) -> f64 {
-        self.0 = self.0.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
-        (self.0 >> 11) as f64 / (1_u64 << 53) as f64
-    }
-}
-
 struct Run {
     /// Largest error against the motion delayed by what `captured` says, rad.
     error: f64,
@@ -42,12 +33,12 @@ struct Run {
 
 /// 20 s of the motion, sent every `period` ms, over a link of `delay` +- `jitter` ms with `loss`; newest wins.
 fn run(params: PlayoutParams, period: u64, delay: f64, jitter: f64, loss: f64) -> Run {
-    let mut dice = Dice(1);
+    let mut dice = Noise(1);
     let mut arrivals: Vec<(u64, u64)> = (0..20_000 / period)
         .map(|n| n * period * MS + MS * 1000)
         .filter_map(|captured| {
-            let transit = ((delay + jitter * (2.0 * dice.roll() - 1.0)) * 1e6) as u64;
-            (dice.roll() >= loss).then_some((captured + transit, captured))
+            let transit = ((delay + jitter * (2.0 * dice.uniform() - 1.0)) * 1e6) as u64;
+            (dice.uniform() >= loss).then_some((captured + transit, captured))
         })
         .collect();
     arrivals.sort_unstable();

@@ -7,6 +7,7 @@
 
 mod motion;
 mod tips;
+mod world;
 
 pub use motion::{Intervention, MAX_PENETRATION, MotionGuard};
 pub use tips::TipGuard;

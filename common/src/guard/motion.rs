@@ -16,11 +16,8 @@
 
 use nalgebra::Vector3;
 
-use super::direction;
-use crate::hand::{
-    Body, BodyIndex, Frame, HandModel, JointVector, MAX_BODIES, MAX_FINGER_JOINTS, MAX_FINGERS, Nearest,
-    between_segments,
-};
+use super::world::{BODIES, Contact, Other, Pair, World, flat};
+use crate::hand::{BodyIndex, HandModel, JointVector, MAX_FINGER_JOINTS, MAX_FINGERS};
 
 /// No command brings two bodies further into each other, m. Two fingertips: or `TIP_SLACK` more than they may.
 pub const MAX_PENETRATION: f64 = 0.001;
@@ -73,25 +70,6 @@ pub struct MotionGuard {
     levers: [[f64; MAX_FINGER_JOINTS]; BODIES],
 }
 
-/// Room for the bodies of all fingers, those of one finger in a row.
-const BODIES: usize = MAX_FINGERS * MAX_BODIES;
-
-/// Two bodies, or a body and a box of the palm.
-#[derive(Clone, Copy, Debug)]
-struct Pair {
-    a: usize,
-    other: Other,
-    // Overlap at which they are held back, and at which they are stopped, m.
-    hold: f64,
-    stop: f64,
-}
-
-#[derive(Clone, Copy, Debug)]
-enum Other {
-    Body(usize),
-    Palm(usize),
-}
-
 /// A pair that is near: its number, its gap, and the least that it may get, m.
 #[derive(Clone, Copy, Default)]
 struct Near {
@@ -104,25 +82,6 @@ struct Near {
 struct List<T, const N: usize> {
     items: [T; N],
     len: usize,
-}
-
-/// A pair of capsules: how fast its gap grows by the joints of the two fingers.
-#[derive(Clone, Copy, Default)]
-struct Contact {
-    slopes: [f64; 2 * MAX_FINGER_JOINTS],
-    joints: [u8; 2 * MAX_FINGER_JOINTS],
-    // Of the finger that gives way. Without one that may, both do.
-    moves: [bool; 2 * MAX_FINGER_JOINTS],
-    len: u8,
-    room: f64,
-}
-
-/// The hand in a posture.
-struct World {
-    frames: [[Frame; MAX_FINGER_JOINTS]; MAX_FINGERS],
-    // Axis of the capsule around each body, and its middle.
-    axes: [[Vector3<f64>; 2]; BODIES],
-    middles: [Vector3<f64>; BODIES],
 }
 
 impl MotionGuard {
@@ -365,18 +324,6 @@ impl MotionGuard {
     }
 }
 
-impl Pair {
-    /// The most that the gap can close, m.
-    fn way(&self, ways: &[f64; BODIES]) -> f64 {
-        ways[self.a] + if let Other::Body(b) = self.other { ways[b] } else { 0.0 }
-    }
-
-    fn fingers(&self) -> impl Iterator<Item = usize> {
-        let other = if let Other::Body(b) = self.other { Some(b / MAX_BODIES) } else { None };
-        std::iter::once(self.a / MAX_BODIES).chain(other)
-    }
-}
-
 /// Slows until every contact parts as fast as it should; false if some cannot. `all`: everybody gives way.
 ///
 /// Least change in the squares by Gauss-Seidel over the contacts, among the joints that are not at their end.
@@ -424,115 +371,6 @@ fn relax(
         }
     }
     false
-}
-
-impl Contact {
-    /// Joints that give way, and what they do to the gap, m/rad.
-    fn own(&self, all: bool) -> impl Iterator<Item = (usize, f64)> {
-        let joints = self.joints.iter().zip(&self.slopes).zip(&self.moves).take(usize::from(self.len));
-        joints.filter(move |(_, moves)| all || **moves).map(|((&joint, &slope), _)| (usize::from(joint), slope))
-    }
-}
-
-impl World {
-    fn new(hand: &HandModel, q: &JointVector) -> Self {
-        let mut out = Self {
-            frames: [[Frame::default(); MAX_FINGER_JOINTS]; MAX_FINGERS],
-            axes: [[Vector3::zeros(); 2]; BODIES],
-            middles: [Vector3::zeros(); BODIES],
-        };
-        for finger in 0..hand.fingers.len() {
-            out.place(hand, finger, q);
-        }
-        out
-    }
-
-    fn place(&mut self, hand: &HandModel, finger: usize, q: &JointVector) {
-        let chain = &hand.fingers[finger];
-        let frames = &mut self.frames[finger];
-        chain.frames(&chain.select(q)[..chain.joints.len()], frames);
-        for (index, body) in hand.collision.fingers[finger].iter().enumerate() {
-            let axis = frames[body.slot].capsule(&body.bound).ends;
-            self.middles[flat((finger, index))] = (axis[0] + axis[1]) * 0.5;
-            self.axes[flat((finger, index))] = axis;
-        }
-    }
-
-    /// The same by the capsules around the bodies.
-    fn bounds_clear(&self, hand: &HandModel, pair: &Pair, reach: f64) -> bool {
-        let own = &self.axes[pair.a];
-        let ([p, q], radius) = match pair.other {
-            Other::Body(b) => (between_segments(own, &self.axes[b]), body(hand, b).bound.radius),
-            Other::Palm(block) => (hand.collision.palm[block].nearest(own), hand.collision.palm[block].radius),
-        };
-        let size = body(hand, pair.a).bound.radius + radius + reach;
-        (q - p).norm_squared() > size * size
-    }
-
-    /// The gap of a pair, m.
-    fn gap(&self, hand: &HandModel, pair: &Pair) -> f64 {
-        let mut gap = f64::INFINITY;
-        self.each(hand, pair, |points, radii| gap = gap.min((points[1] - points[0]).norm() - radii));
-        gap
-    }
-
-    /// The nearest points of the axes of all the capsules of a pair, and the sum of their radii.
-    fn each(&self, hand: &HandModel, pair: &Pair, mut visit: impl FnMut(Nearest, f64)) {
-        let frame = |index: usize| &self.frames[index / MAX_BODIES][body(hand, index).slot];
-        for own in &body(hand, pair.a).capsules {
-            let own = frame(pair.a).capsule(own);
-            match pair.other {
-                Other::Body(b) => {
-                    for other in &body(hand, b).capsules {
-                        let other = frame(b).capsule(other);
-                        visit(between_segments(&own.ends, &other.ends), own.radius + other.radius);
-                    }
-                }
-                Other::Palm(block) => {
-                    let block = &hand.collision.palm[block];
-                    visit(block.nearest(&own.ends), own.radius + block.radius);
-                }
-            }
-        }
-    }
-
-    fn contact(
-        &self,
-        hand: &HandModel,
-        pair: &Pair,
-        points: Nearest,
-        room: f64,
-        movable: &[bool; MAX_FINGERS],
-    ) -> Contact {
-        let normal = direction(points[1] - points[0]);
-        let mut out = Contact { room, ..Contact::default() };
-        let anyone = pair.fingers().any(|finger| movable[finger]);
-        let mut add = |index: usize, point: Vector3<f64>, sign: f64| {
-            let finger = index / MAX_BODIES;
-            let slots = 0..=body(hand, index).slot;
-            for (joint, frame) in hand.fingers[finger].joints[slots].iter().zip(&self.frames[finger]) {
-                let slot = usize::from(out.len);
-                out.joints[slot] = joint.joint as u8;
-                out.slopes[slot] = sign * frame.axis.cross(&(point - frame.position)).dot(&normal);
-                out.moves[slot] = movable[finger] || !anyone;
-                out.len += 1;
-            }
-        };
-        add(pair.a, points[0], -1.0);
-        if let Other::Body(b) = pair.other {
-            add(b, points[1], 1.0);
-        }
-        out
-    }
-}
-
-/// The number of a body.
-const fn flat((finger, index): BodyIndex) -> usize {
-    finger * MAX_BODIES + index
-}
-
-fn body(hand: &HandModel, index: usize) -> &Body {
-    &hand.collision.fingers[index / MAX_BODIES][index % MAX_BODIES]
 }
 
 impl<T: Copy + Default, const N: usize> List<T, N> {
