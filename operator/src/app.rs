@@ -8,13 +8,13 @@ use anyhow::{Context as _, anyhow};
 use teleop_common::key::Keys;
 use teleop_common::master::Gesture;
 use teleop_common::net::clock::random_epoch;
-use teleop_common::net::{Session, keyboard};
+use teleop_common::net::{Session, SessionConfig, keyboard};
 
 use crate::calibrate;
 use crate::cli::{Cli, Command, ListArgs, LogArgs, StopArgs, WatchArgs};
 use crate::failure::{Failure, OrFail as _, not_open};
 use crate::feedback::Feedback;
-use crate::list::list;
+use crate::list::{LINK_TIMEOUT, list};
 use crate::request::{Requester, Wish};
 use crate::robot_link::RobotLink;
 use crate::run::run;
@@ -134,9 +134,15 @@ fn stop_robot(args: &StopArgs) -> Result<(), Failure> {
 }
 
 fn list_robots(args: &ListArgs, shutdown: &Shutdown) -> Result<(), Failure> {
-    let session = Session::open(&args.link.session(&args.connect)).map_err(not_open)?;
-    list(&session, Duration::from_secs_f64(args.time), args.json, shutdown).or_runtime()?;
-    Ok(())
+    let config = SessionConfig { open_timeout: LINK_TIMEOUT, ..args.link.session(&args.connect) };
+    let session = Session::open(&config).map_err(not_open)?;
+    if list(&session, Duration::from_secs_f64(args.time), args.json, shutdown).or_runtime()? || shutdown.requested() {
+        return Ok(());
+    }
+    let at = args.connect.join(", ");
+    Err(Failure::Runtime(anyhow!(
+        "nobody answers at {at}: is a robot or a router running there, and is --connect right?"
+    )))
 }
 
 fn watch_robot(args: &WatchArgs, shutdown: &Shutdown) -> Result<(), Failure> {

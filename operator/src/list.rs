@@ -15,6 +15,9 @@ use crate::robot_link::hear;
 use crate::shutdown::Shutdown;
 use crate::terminal::say;
 
+/// Time that a link gets to come about: a handshake over a satellite.
+pub const LINK_TIMEOUT: Duration = Duration::from_secs(5);
+const LOOK: Duration = Duration::from_millis(20);
 /// Time robots get to show that they are alive.
 const LIVE_TIMEOUT: Duration = Duration::from_secs(1);
 /// Most robots that are listed.
@@ -32,11 +35,18 @@ struct Row {
     holds: Option<u64>,
 }
 
-/// Prints the robots that `session` reaches, after `time` of listening to them: a table, or a line of JSON each.
+/// Prints the robots that `session` reaches, after `time` of listening to them: a table, or a line of JSON each. False
+/// if nobody at all answers.
 ///
 /// # Errors
 /// The session is closed.
-pub fn list(session: &Session, time: Duration, json: bool, shutdown: &Shutdown) -> Result<usize, NetError> {
+pub fn list(session: &Session, time: Duration, json: bool, shutdown: &Shutdown) -> Result<bool, NetError> {
+    let end = now() + LINK_TIMEOUT;
+    while session.peers() == 0 {
+        if now() > end || shutdown.wait(LOOK) {
+            return Ok(false);
+        }
+    }
     let mut robots = BTreeMap::new();
     for key in session.live_now(&Keys::all_live_robots(), LIVE_TIMEOUT)? {
         if let Some(keys) = Keys::of_live_robot(&key)
@@ -59,7 +69,7 @@ pub fn list(session: &Session, time: Duration, json: bool, shutdown: &Shutdown) 
             break;
         }
     }
-    Ok(rows.len())
+    Ok(true)
 }
 
 fn row(name: &str, feedback: &Feedback) -> Row {

@@ -7,6 +7,7 @@ use std::time::{Duration, Instant};
 
 use indicatif::{MultiProgress, ProgressBar, ProgressStyle};
 use teleop_common::mode::Mode;
+use teleop_common::wire::WireError;
 
 use crate::feedback::{Reason, Snapshot};
 use crate::pipeline::Progress;
@@ -91,8 +92,11 @@ pub fn status_line(status: &Status) -> String {
     if progress.bad > 0 {
         part(format!("{} bad inputs", progress.bad));
     }
-    if robot.bad > 0 {
-        part(format!("{} bad messages", robot.bad));
+    match robot.first_bad {
+        // Nothing else that it says can be read.
+        Some(error @ WireError::Protocol { .. }) => part(format!("ERROR: {error}")),
+        Some(error) => part(format!("{} bad messages, the first: {error}", robot.bad)),
+        None => {}
     }
     if robot.rivals {
         part(format!("ERROR: two robots are called {name}"));
@@ -376,6 +380,21 @@ mod tests {
             "robot allegro  not connected (tcp/127.0.0.1:7447)  |  calibrating 40 %  |  fit 3.1 mm  |  2 skipped  |  \
              3 bad inputs  |  ERROR: 4 frames missing in the recording  |  ERROR: keypoints are those of a left hand"
         );
+    }
+
+    #[test]
+    fn a_robot_of_another_release_is_told_of() {
+        let feedback = Feedback::new(7);
+        let header = Header::new::<HealthMessage>(9, 1, MonoTime(0));
+        let mut other = [0; HealthMessage::LEN];
+        other[..4].copy_from_slice(&header.magic());
+        other[4] = 99;
+        feedback.on_joints(Arrival { payload: Ok(&other), at: MonoTime(0) });
+        let robot = feedback.snapshot(MonoTime(0));
+        let line = status_line(&Status { robot, ..status(None) });
+        assert!(line.contains("not connected") && line.contains("ERROR: peer speaks wire protocol 99"), "{line}");
+        feedback.on_joints(Arrival { payload: Ok(b"hello"), at: MonoTime(0) });
+        assert!(status_line(&Status { robot: feedback.snapshot(MonoTime(0)), ..status(None) }).contains("ERROR"));
     }
 
     #[test]

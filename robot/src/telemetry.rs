@@ -11,8 +11,8 @@ use teleop_common::net::{NetError, Publisher, Session, Stream, clock};
 use teleop_common::time::{Histogram, MonoTime};
 use teleop_common::viz::{Level, Logger, RobotFrame};
 use teleop_common::wire::{
-    HealthMessage, JointStateMessage, MappingMessage, Quantiles, REJECTIONS, Rejection, STAGES, Stage, Stamper,
-    latency_report, pack_joints,
+    HealthMessage, JointStateMessage, MappingMessage, PROTOCOL, Quantiles, REJECTIONS, Rejection, STAGES, Stage,
+    Stamper, latency_report, pack_joints,
 };
 
 use crate::control::Fault;
@@ -38,6 +38,8 @@ pub struct Telemetry {
     next_health: MonoTime,
     next_view: MonoTime,
     mode: Option<Mode>,
+    // Told that an operator speaks another version.
+    told_version: bool,
     // Counters at the last change of mode.
     rejected: [u64; REJECTIONS],
     tick_times: Histogram,
@@ -78,6 +80,7 @@ impl Telemetry {
             next_health: MonoTime(0),
             next_view: MonoTime(0),
             mode: None,
+            told_version: false,
             rejected: [0; REJECTIONS],
             tick_times: Histogram::default(),
             stages: [Histogram::default(); STAGES],
@@ -158,6 +161,11 @@ impl Telemetry {
             let receiver = self.receiver.lock().unwrap_or_else(PoisonError::into_inner);
             (receiver.counts().clone(), receiver.holder(clock::now()))
         };
+        if counts.rejected[Rejection::Protocol.index()] > 0 && !std::mem::replace(&mut self.told_version, true) {
+            let text = format!("poses of another wire protocol than {PROTOCOL}: run the same release on both ends");
+            tracing::error!("{text}");
+            self.logger.log_text(wall(tick.now), Level::Error, &text);
+        }
         let message = HealthMessage {
             header: self.health.1.header::<HealthMessage>(clock::now()),
             mode: tick.mode.to_wire(),
