@@ -22,6 +22,14 @@ pub struct State {
     pub message: Checked<JointStateMessage>,
 }
 
+impl State {
+    /// Whether the hand goes where the operator's is.
+    #[must_use]
+    pub fn follows(&self) -> bool {
+        self.mode().is_some_and(Mode::follows)
+    }
+}
+
 impl std::ops::Deref for State {
     type Target = JointStateMessage;
 
@@ -195,7 +203,7 @@ impl Probe {
 /// How many measured joints covered more than `angle` (rad) while the robot followed.
 #[must_use]
 pub fn moved(states: &[State], angle: f64) -> usize {
-    let engaged = || states.iter().filter(|state| state.mode().is_some_and(Mode::follows)).map(|state| state.q());
+    let engaged = || states.iter().filter(|state| state.follows()).map(|state| state.q());
     let Some(first) = engaged().next() else { return 0 };
     let covered = |joint: usize| {
         let (low, high) = engaged()

@@ -31,6 +31,24 @@ pub fn free_endpoint() -> String {
     format!("tcp/{}", TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap())
 }
 
+/// Arguments as a process takes them.
+#[must_use]
+pub fn strs(list: &[String]) -> Vec<&str> {
+    list.iter().map(String::as_str).collect()
+}
+
+/// A configuration file of the robot, in a folder that is removed when it is dropped.
+///
+/// # Panics
+/// If it cannot be written.
+#[must_use]
+pub fn config(text: &str) -> (tempfile::TempDir, String) {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("robot.toml");
+    std::fs::write(&path, text).unwrap();
+    (folder, path.to_str().unwrap().to_owned())
+}
+
 /// Runs a binary to its end, with what it printed.
 #[must_use]
 pub fn run(name: &str, arguments: &[&str]) -> Output {

@@ -18,7 +18,7 @@ use teleop_common::net::Arrival;
 use teleop_common::time::MonoTime;
 use teleop_common::wire::{Echo, MAX_MESSAGE, PoseMessage, Stamper, encode_into};
 use teleop_link::Dice;
-use teleop_robot::control::{ControlParams, Controller, Fault, PoseSample, TickRecord};
+use teleop_robot::control::{ControlParams, Controller, Fault, PoseSample, Relax, StopAction, TickRecord};
 use teleop_robot::driver::{DriverError, HandDriver, JointCommand, JointState, Pace, SimHand};
 use teleop_robot::receive::Receiver;
 use teleop_robot::runtime::{ControlThread, Realtime, Shared};
@@ -362,6 +362,120 @@ fn no_stream_of_poses_breaks_a_limit() {
         let closest = closest * 1e3;
         println!("{}: {valid} poses, {holds} holds, fastest {fastest:.2} rad/s, gap {closest:.3} mm", side.name());
         assert!(valid > 10_000 && holds > 20 && fastest > 6.9, "{valid} poses, {holds} holds, {fastest} rad/s");
+    }
+}
+
+/// A controller that was engaged with a fist, and then what `params` says of a hold or a stop.
+fn engaged(params: ControlParams) -> Bench {
+    let mut bench = Bench::right();
+    bench.controller = Controller::new(bench.hand.clone(), MappingParams::default(), params).unwrap();
+    for tick in 0..700_u32 {
+        let sample = bench.sample(pose(Gesture::Fist, 2.0), tick.into());
+        bench.tick(Some(&sample));
+    }
+    assert_eq!(bench.controller.mode(), Mode::Engaged);
+    bench
+}
+
+/// Ticks without a pose for `seconds`.
+fn silence(bench: &mut Bench, seconds: f64) -> TickRecord {
+    (0..(seconds * RATE) as u32).map(|_| bench.tick(None)).last().unwrap()
+}
+
+/// How far the commands of two ticks are apart, rad.
+fn apart(a: &TickRecord, b: &TickRecord) -> f64 {
+    a.command.q.iter().zip(b.command.q.iter()).fold(0.0, |most: f64, (a, b)| most.max((a - b).abs()))
+}
+
+#[test]
+fn a_hold_that_lasts_does_what_was_configured() {
+    let params = |relax| ControlParams { relax, relax_after: Duration::from_secs(1), ..ControlParams::default() };
+    for relax in [Relax::Hold, Relax::Yield, Relax::Open, Relax::Off] {
+        let mut bench = engaged(params(relax));
+        let holding = silence(&mut bench, 0.8);
+        assert_eq!(holding.mode, Mode::Holding, "{relax:?}");
+        // Somebody pulls at the index finger.
+        let mut pulled = bench.driver.read(Duration::ZERO).unwrap();
+        pulled.q[1] -= 0.5;
+        let torque = |bench: &mut Bench| {
+            bench.now = bench.now + PERIOD;
+            bench.controller.tick(bench.now, Latch::default(), &pulled).command.tau[1]
+        };
+        let firm = torque(&mut bench);
+        assert!(firm > 0.1, "{firm} N m");
+        let mut last = silence(&mut bench, 1.0);
+        assert_eq!(last.mode, if relax == Relax::Hold { Mode::Holding } else { Mode::Relaxed }, "{relax:?}");
+        match relax {
+            Relax::Hold => assert_eq!(apart(&last, &holding), 0.0),
+            Relax::Yield => {
+                assert_eq!(apart(&last, &holding), 0.0);
+                let most = 0.2 * bench.hand.joints[1].torque;
+                assert!((torque(&mut bench) - most.min(firm)).abs() < 1e-9, "{} N m", torque(&mut bench));
+            }
+            Relax::Off => assert!(last.command.tau.iter().all(|tau| *tau == 0.0)),
+            Relax::Open => {
+                for _ in 0..2000 {
+                    let record = bench.tick(None);
+                    assert!(speed(&last, &record) <= 1.0 + 1e-9, "{} rad/s", speed(&last, &record));
+                    last = record;
+                }
+                let home = bench.hand.home();
+                assert!(
+                    last.command.q.iter().zip(home.iter()).all(|(a, b)| (a - b).abs() < 0.05),
+                    "{:?}",
+                    last.command.q
+                );
+            }
+        }
+        // Whatever it did, it follows again from where it is, when the clutch is closed anew.
+        let mut before = silence(&mut bench, 0.1);
+        for tick in 0..400_u32 {
+            let sample = bench.sample(pose(Gesture::Open, 0.0), 1000 + u64::from(tick));
+            let record = bench.tick(Some(&sample));
+            // A limp hand is commanded where it is, and may sink.
+            if tick > 2 {
+                assert!(speed(&before, &record) <= 1.0 + 9.0 * f64::from(tick) / RATE, "{relax:?} at tick {tick}");
+            }
+            before = record;
+        }
+        assert_eq!(before.mode, Mode::Engaged, "{relax:?}");
+    }
+}
+
+#[test]
+fn a_stop_brakes_and_then_holds_or_lets_go() {
+    for stop in [StopAction::Hold, StopAction::Off] {
+        let mut bench = engaged(ControlParams { stop, ..ControlParams::default() });
+        for tick in 0..60_u32 {
+            let sample = bench.sample(pose(Gesture::Open, 0.0), 700 + u64::from(tick));
+            bench.tick(Some(&sample));
+        }
+        bench.latch = bench.latch.stop();
+        let first = bench.tick(None);
+        assert_eq!(first.mode, Mode::Stopped);
+        assert!(first.command.dq.iter().any(|dq| dq.abs() > 0.5), "it was moving, and brakes within its limits");
+        let stopped = silence(&mut bench, 0.3);
+        let limp = stopped.command.tau.iter().all(|tau| *tau == 0.0);
+        assert_eq!(limp, stop == StopAction::Off);
+        let later = silence(&mut bench, 0.3);
+        if stop == StopAction::Hold {
+            assert_eq!(apart(&stopped, &later), 0.0);
+        }
+        // Poses and a clutch change nothing until the reset, and then nothing moves either.
+        for tick in 0..50_u32 {
+            let sample = bench.sample(pose(Gesture::Open, 0.0), 2000 + u64::from(tick));
+            assert_eq!(bench.tick(Some(&sample)).mode, Mode::Stopped);
+        }
+        bench.eager = false;
+        bench.latch = bench.latch.reset(bench.latch.asked);
+        let mut last = bench.tick(None);
+        for tick in 0..50_u32 {
+            let sample = bench.sample(pose(Gesture::Open, 0.0), 3000 + u64::from(tick));
+            let record = bench.tick(Some(&sample));
+            assert!(matches!(record.mode, Mode::Disarmed | Mode::Armed), "{:?}", record.mode);
+            assert_eq!(apart(&last, &record), 0.0, "tick {tick}");
+            last = record;
+        }
     }
 }
 

@@ -26,10 +26,6 @@ fn judge(states: &[State]) -> Extremes {
     assert_limits(&commands(states), &HandModel::allegro_v4(HandSide::Right), RATE, RESOLUTION)
 }
 
-fn follows(state: &State) -> bool {
-    state.mode().is_some_and(Mode::follows)
-}
-
 fn age(state: &State) -> f64 {
     state.header.sent.since(state.pose_captured).as_secs_f64()
 }
@@ -132,7 +128,7 @@ fn a_robot_that_stood_still_holds_and_obeys_nothing_old() {
         // What was admitted before it stood still is as old as that when it wakes. The first few ticks may be from before:
         // those between two states, and what waited to be sent.
         let woken: Vec<State> = states.iter().copied().filter(|state| state.tick > before.tick + 8).collect();
-        let oldest = woken.iter().filter(|state| follows(state)).map(age).fold(0.0, f64::max);
+        let oldest = woken.iter().filter(|state| state.follows()).map(age).fold(0.0, f64::max);
         // Poses that waited in the system's buffers may be fresh enough to go on with; mostly the watchdog is first.
         let held = states.iter().any(|state| state.mode() == Some(Mode::Holding));
         println!("stood still for {time} s: held {held}, oldest obeyed later {:.0} ms", 1e3 * oldest);
@@ -155,7 +151,7 @@ fn an_operator_that_was_killed_is_replaced_when_its_lease_is_over() {
         operator.kill();
         operator = Process::operator(robot.endpoint(), "wave", &[]);
         eventually("another one is followed", || {
-            probe.last().is_some_and(|state| follows(&state) && state.pose_epoch != epoch)
+            probe.last().is_some_and(|state| state.follows() && state.pose_epoch != epoch)
         });
         let states = probe.since(mark);
         let killed = states.iter().rfind(|state| state.pose_epoch == epoch).unwrap();
@@ -183,7 +179,7 @@ fn fight(takeover: &str) -> (usize, u64, Vec<State>) {
     let states = probe.since(mark);
     let changes = states.windows(2).filter(|pair| pair[0].holder != pair[1].holder).count();
     let refused = probe.rejected(Rejection::Takeover);
-    let share = states.iter().filter(|state| follows(state)).count() as f64 / states.len() as f64;
+    let share = states.iter().filter(|state| state.follows()).count() as f64 / states.len() as f64;
     println!("takeover {takeover}: {changes} changes, {refused} refused, followed {:.0} % of the time", 100.0 * share);
     judge(&probe.states());
     for process in [&first, &second, &robot.process] {
@@ -199,14 +195,14 @@ fn two_operators_that_fight_do_no_harm() {
         let (changes, refused, states) = fight(takeover);
         assert_eq!(changes, 0);
         assert!(refused > 100, "{refused}");
-        assert!(states.iter().all(|state| follows(state) && state.holder == states[0].holder));
+        assert!(states.iter().all(|state| state.follows() && state.holder == states[0].holder));
     }
     let (changes, _refused, states) = fight("always");
     assert!(changes > 0);
     // Whoever takes it, the hand does not go on with another's poses: it stops first.
     for pair in states.windows(2) {
         let changed = pair[0].pose_epoch != pair[1].pose_epoch && pair[1].tick <= pair[0].tick + 4;
-        let goes_on = changed && follows(&pair[0]) && pair[1].mode() == Some(Mode::Engaged);
+        let goes_on = changed && pair[0].follows() && pair[1].mode() == Some(Mode::Engaged);
         assert!(!goes_on, "tick {}", pair[1].tick);
     }
 }

@@ -9,8 +9,6 @@
 
 #![allow(clippy::unwrap_used, reason = "helpers of tests")]
 
-use std::path::Path;
-use std::process::Command;
 use std::time::Duration;
 
 use teleop_common::hand::{HandModel, HandSide, JointVector};
@@ -19,10 +17,11 @@ use teleop_common::mode::Mode;
 use teleop_common::net::clock::now;
 use teleop_common::time::MonoTime;
 use teleop_link::{Endpoint, Impairment, Link, Profile, Relay};
+use teleop_tests::certificates::Certificates;
 use teleop_tests::eventually;
 use teleop_tests::judge::{assert_limits, commands};
 use teleop_tests::probe::{Probe, State};
-use teleop_tests::process::{Process, Robot};
+use teleop_tests::process::{Process, Robot, strs};
 
 const RATE: f64 = 333.0;
 const RESOLUTION: f64 = 2.5e-7;
@@ -41,40 +40,17 @@ struct Pair {
     relay: Relay,
     operator: Process,
     _robot: Robot,
-    _folder: tempfile::TempDir,
-}
-
-/// A certificate for 127.0.0.1 and its key, made by the program `openssl`.
-fn certificate(folder: &Path) -> [String; 2] {
-    let [certificate, key] = ["cert.pem", "key.pem"].map(|name| folder.join(name).to_str().unwrap().to_owned());
-    let made = Command::new("openssl")
-        .args(["req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes", "-days", "2"])
-        .args(["-subj", "/CN=robot", "-addext", "subjectAltName=IP:127.0.0.1"])
-        .args(["-addext", "basicConstraints=critical,CA:FALSE", "-keyout", &key, "-out", &certificate])
-        .output()
-        .unwrap();
-    assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
-    [certificate, key]
+    _certificates: Option<Certificates>,
 }
 
 impl Pair {
     fn start(protocol: &str, link: impl Into<Link>, seed: u64) -> Self {
-        let folder = tempfile::tempdir().unwrap();
-        let (listen, options) = match protocol {
-            "quic" => {
-                let [certificate, key] = certificate(folder.path());
-                let listen = format!("#listen_certificate_file={certificate};listen_private_key_file={key}");
-                (listen, format!("?mixed_rel=auto#root_ca_certificate_file={certificate}"))
-            }
-            _ => (String::new(), String::new()),
-        };
-        let relation = if protocol == "quic" { "?mixed_rel=auto" } else { "" };
+        let certificates = (protocol == "quic").then(|| Certificates::of(&["robot", "operator"]));
+        let flags = |name| certificates.as_ref().map_or_else(Vec::new, |certificates| certificates.flags(name));
         // Two of one protocol would be told apart by nothing.
         let clean = if protocol == "tcp" { "udp" } else { "tcp" };
-        let robot = Robot::listening(
-            &[&format!("{protocol}/127.0.0.1:0{relation}{listen}"), &format!("{clean}/127.0.0.1:0")],
-            &[],
-        );
+        let endpoints = [&*format!("{protocol}/127.0.0.1:0"), &format!("{clean}/127.0.0.1:0")];
+        let robot = Robot::listening(&endpoints, &strs(&flags("robot")));
         let carrier = if protocol == "tcp" { "tcp" } else { "udp" };
         let address = robot.endpoints[0].trim_start_matches(&format!("{protocol}/"));
         let target: Endpoint = format!("{carrier}/{}", address.split(['?', '#']).next().unwrap()).parse().unwrap();
@@ -82,8 +58,9 @@ impl Pair {
         let relay = Relay::start(&listen, &target, &link.into(), seed).unwrap();
         let probe = Probe::connect(&robot.endpoints[1]);
         probe.wait_for(Mode::Disarmed);
-        let operator = Process::operator(&format!("{protocol}/{}{options}", relay.address()), "wave", &[]);
-        Self { probe, relay, operator, _robot: robot, _folder: folder }
+        let far = format!("{protocol}/{}", relay.address());
+        let operator = Process::operator(&far, "wave", &strs(&flags("operator")));
+        Self { probe, relay, operator, _robot: robot, _certificates: certificates }
     }
 }
 
@@ -100,10 +77,6 @@ struct Outcome {
     fresh: f64,
     /// To the hand's following again, s.
     follows: f64,
-}
-
-fn follows(state: &State) -> bool {
-    state.mode().is_some_and(Mode::follows)
 }
 
 fn pose(state: &State) -> (u64, u64) {
@@ -143,7 +116,7 @@ fn outage(pair: &Pair, length: Duration) -> Outcome {
     };
     let last = probe.since(mark).iter().take_while(|state| state.header.sent <= end).last().map(pose).unwrap();
     let fresh = first_after(&|state| pose(state) != last);
-    let following = first_after(&follows);
+    let following = first_after(&State::follows);
     let states = probe.since(mark);
     let holding = states.iter().position(|state| state.mode() == Some(Mode::Holding));
     let held = holding.map(|at| {

@@ -15,7 +15,7 @@ use teleop_common::time::MonoTime;
 use teleop_common::wire::{Echo, MAX_MESSAGE, PoseMessage, Rejection, Stamper, encode_into};
 use teleop_tests::judge::{Extremes, assert_limits, commands, spread};
 use teleop_tests::probe::{Probe, State};
-use teleop_tests::process::{Process, Robot, Signal, free_endpoint, run};
+use teleop_tests::process::{Process, Robot, Signal, config, free_endpoint, run};
 use teleop_tests::{PATIENCE, eventually};
 
 const RATE: f64 = 333.0;
@@ -35,16 +35,12 @@ fn is(mode: Mode) -> impl Fn(&State) -> bool {
     move |state| state.mode() == Some(mode)
 }
 
-fn follows(state: &State) -> bool {
-    state.mode().is_some_and(Mode::follows)
-}
-
 /// Waits until the robot follows an operator other than `former`, and gives its epoch.
 #[track_caller]
 fn follows_another(probe: &Probe, former: u64) -> u64 {
     let mut epoch = 0;
     eventually("the robot follows another operator", || {
-        epoch = probe.last().filter(follows).map_or(0, |state| state.pose_epoch);
+        epoch = probe.last().filter(State::follows).map_or(0, |state| state.pose_epoch);
         epoch != 0 && epoch != former
     });
     epoch
@@ -160,7 +156,7 @@ fn a_killed_operator_leaves_the_hand_still_and_the_next_one_goes_on() {
     println!("killed and replaced: {extremes:?}");
 
     // It starts from where it stood, slowly: 1 rad/s at first, ten times that after a second.
-    let resumed = holding + states[holding..].iter().position(follows).unwrap();
+    let resumed = holding + states[holding..].iter().position(State::follows).unwrap();
     let start = states[resumed].tick;
     for pair in commands(&states[resumed - 1..]).windows(2).take_while(|pair| pair[1].tick < start + 300) {
         let ticks = (pair[1].tick - pair[0].tick) as f64;
@@ -194,7 +190,7 @@ fn a_stopped_operator_delivers_nothing_stale() {
     // thread that a busy machine keeps waiting.
     let oldest = states[woken..]
         .iter()
-        .filter(|state| follows(state))
+        .filter(|state| state.follows())
         .map(|state| state.header.sent.since(state.pose_captured).as_secs_f64())
         .fold(0.0, f64::max);
     println!("oldest pose obeyed after the stop: {:.0} ms", oldest * 1e3);
@@ -236,7 +232,7 @@ fn a_second_operator_waits_for_the_first_to_end() {
     eventually("the second is refused", || probe.rejected(Rejection::Operator) > 100);
     probe.wait_for_more(50);
     for state in probe.since(before) {
-        assert_eq!((follows(&state), state.pose_epoch), (true, epoch), "at tick {}", state.tick);
+        assert_eq!((state.follows(), state.pose_epoch), (true, epoch), "at tick {}", state.tick);
     }
     first.stop(Signal::Term);
     follows_another(&probe, epoch);
@@ -294,22 +290,15 @@ fn garbage_disturbs_nothing() {
     probe.wait_for_motion(0.2);
     let driver = probe.last().unwrap().pose_epoch;
     for state in probe.since(engaged) {
-        assert_eq!((follows(&state), state.pose_epoch), (true, driver), "at tick {}", state.tick);
+        assert_eq!((state.follows(), state.pose_epoch), (true, driver), "at tick {}", state.tick);
     }
     assert_ne!(driver, 13);
+    assert!(robot.process.stderr().contains("poses of another wire protocol"), "{}", robot.process.stderr());
     assert!(probe.rejected(Rejection::Malformed) >= 1000, "{:?}", probe.health().unwrap().rejected);
     judge(&probe.states());
     operator.stop(Signal::Term);
     robot.process.assert_no_panic();
     drop(folder);
-}
-
-/// A configuration file.
-fn config(text: &str) -> (tempfile::TempDir, String) {
-    let folder = tempfile::tempdir().unwrap();
-    let path = folder.path().join("robot.toml");
-    std::fs::write(&path, text).unwrap();
-    (folder, path.to_str().unwrap().to_owned())
 }
 
 #[test]
@@ -322,6 +311,7 @@ fn exit_codes_and_messages() {
     };
     let broken = file("broken.toml", "[control]\nrate_hz = \"fast\"\n");
     let range = file("range.toml", "[mapping]\nr2 = 0.001\n");
+    let takeover = file("takeover.toml", "[authority]\ntakeover = \"please\"\n");
     let urdf = file("hand.urdf", "<robot name=\"none\"></robot>");
     let csv = file("hand.csv", "frame,time\n1,2\n");
     let missing = folder.path().join("none.urdf").to_str().unwrap().to_owned();
@@ -352,6 +342,10 @@ fn exit_codes_and_messages() {
         ("operator", &["--calibration", &missing], 2, &[&missing, "No such file"]),
         ("operator", &["--record", busy, "--connect", &free, "--viewer", "off"], 2, &[busy, "folder"]),
         ("operator", &["watch", "--connect", &free, "--timeout", "0.5"], 1, &[&free, "is it running"]),
+        ("operator", &["stop", "--connect", &free], 1, &[&free, "did not confirm the stop", "emergency stop"]),
+        ("operator", &["list", "--connect", &free], 1, &[&free, "nobody answers"]),
+        ("operator", &["--operator", "a name that is too long"], 2, &["a name that is too long", "1 to 16"]),
+        ("robot", &["--config", &takeover], 2, &["please", "never"]),
     ];
     for (name, arguments, code, words) in cases {
         let output = run(name, arguments);

@@ -19,7 +19,7 @@ use teleop_tests::certificates::Certificates;
 use teleop_tests::eventually;
 use teleop_tests::judge::spread;
 use teleop_tests::probe::{Probe, State, moved};
-use teleop_tests::process::{Process, Robot, Signal, free_endpoint, run};
+use teleop_tests::process::{Process, Robot, Signal, config, free_endpoint, run, strs};
 use zenoh::Wait as _;
 use zenoh::qos::{CongestionControl, Priority};
 
@@ -70,28 +70,12 @@ impl Guarded {
     }
 }
 
-fn strs(list: &[String]) -> Vec<&str> {
-    list.iter().map(String::as_str).collect()
-}
-
-/// A configuration file of the robot.
-fn config(text: &str) -> (tempfile::TempDir, String) {
-    let folder = tempfile::tempdir().unwrap();
-    let path = folder.path().join("robot.toml");
-    std::fs::write(&path, text).unwrap();
-    (folder, path.to_str().unwrap().to_owned())
-}
-
-fn follows(state: &State) -> bool {
-    state.mode().is_some_and(Mode::follows)
-}
-
 /// Expects that in all `states` the hand followed `driver`, and moved.
 #[track_caller]
 fn assert_driven(states: &[State], driver: u64) {
     assert!(states.len() >= 20, "only {} states to judge by", states.len());
     for state in states {
-        assert_eq!((follows(state), state.pose_epoch, state.stop), (true, driver, 0), "at tick {}", state.tick);
+        assert_eq!((state.follows(), state.pose_epoch, state.stop), (true, driver, 0), "at tick {}", state.tick);
     }
     assert!(moved(states, 0.2) >= 3, "it hardly moved");
 }

@@ -125,9 +125,7 @@ impl SessionConfig {
             // A zenoh configuration may bring its own.
             None if self.zenoh_config_file.is_some() => {}
             None => {
-                // One that says `#..._certificate_file=` brings its own.
-                let bare = |endpoint: &&String| is_encrypted(endpoint) && !endpoint.contains("certificate");
-                if let Some(endpoint) = endpoints().find(bare) {
+                if let Some(endpoint) = endpoints().find(|endpoint| is_encrypted(endpoint)) {
                     return Err(NetError::NoCertificate { endpoint: endpoint.clone() });
                 }
             }

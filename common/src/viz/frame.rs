@@ -35,7 +35,7 @@ pub struct RobotFrame {
     pub mapping: Option<MappingOutput>,
     /// The robot's mode.
     pub mode: Mode,
-    /// Age of the newest valid pose on the robot's clock, s; `None` before the first.
+    /// Age of the pose that the hand follows, with the delay of the playout, robot's clock, s; `None` before the first.
     pub pose_age: Option<f64>,
     /// Longest duration of a control tick since the last frame, s.
     pub tick: Option<f64>,

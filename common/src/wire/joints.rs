@@ -21,11 +21,11 @@ pub struct JointStateMessage {
     pub tick: u64,
     /// UNIX time minus monotonic time of the robot, ns: labels recordings, nothing else.
     pub wall_offset_ns: i64,
-    /// Epoch of the newest pose obeyed, 0 if none.
+    /// Epoch of the newest pose accepted, 0 if none; the hand follows it if the mode says so.
     pub pose_epoch: u64,
-    /// Sequence number of the newest pose obeyed.
+    /// Sequence number of the newest pose accepted.
     pub pose_seq: u64,
-    /// Capture stamp of the newest pose obeyed, operator's clock.
+    /// Capture stamp of the newest pose accepted, operator's clock.
     pub pose_captured: MonoTime,
     /// Measured angles, rad; zero beyond `joints`, as in the next three.
     pub q: [f32; MAX_JOINTS],
