@@ -50,10 +50,17 @@ impl Keys {
         self.key("cmd/pose")
     }
 
-    /// Stops and resets, anybody to robot: [`crate::wire::ControlMessage`].
+    /// Stops, from anybody who may watch to the robot: [`crate::wire::ControlMessage`].
     #[must_use]
-    pub fn control(&self) -> String {
-        self.key("cmd/control")
+    pub fn stop(&self) -> String {
+        self.key("cmd/stop")
+    }
+
+    /// Resets of a stop, from who may drive to the robot: [`crate::wire::ControlMessage`]. A key of its own, so that
+    /// access to it can be.
+    #[must_use]
+    pub fn reset(&self) -> String {
+        self.key("cmd/reset")
     }
 
     /// Joint state, robot to all: [`crate::wire::JointStateMessage`].
@@ -163,6 +170,8 @@ mod tests {
     fn layout() {
         let keys = Keys::new("allegro").unwrap();
         assert_eq!(keys.pose(), "allegro/v1/allegro/cmd/pose");
+        assert_eq!(keys.stop(), "allegro/v1/allegro/cmd/stop");
+        assert_eq!(keys.reset(), "allegro/v1/allegro/cmd/reset");
         assert_eq!(keys.joints(), "allegro/v1/allegro/state/joints");
         assert_eq!(keys.mapping(), "allegro/v1/allegro/state/mapping");
         assert_eq!(keys.health(), "allegro/v1/allegro/state/health");

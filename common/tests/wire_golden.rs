@@ -57,7 +57,7 @@ fn offsets_of_the_document() {
 
     let message = pose();
     encode_into(&message, &mut bytes).unwrap();
-    assert_eq!(&bytes[..8], b"ALGT\x03\x00\x01\x00");
+    assert_eq!(&bytes[..8], b"ALGT\x04\x00\x01\x00");
     assert_eq!(u64_at(&bytes, 8), message.header.epoch);
     assert_eq!(u64_at(&bytes, 16), message.header.seq);
     assert_eq!(u64_at(&bytes, 24), message.header.sent.0);

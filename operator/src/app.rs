@@ -14,7 +14,8 @@ use crate::calibrate;
 use crate::cli::{Cli, Command, ListArgs, LogArgs, StopArgs, WatchArgs};
 use crate::failure::{Failure, OrFail as _, not_open};
 use crate::feedback::Feedback;
-use crate::list::{LINK_TIMEOUT, list};
+use crate::lan::{find, locate};
+use crate::list::{LINK_TIMEOUT, list, show};
 use crate::request::{Requester, Wish};
 use crate::robot_link::RobotLink;
 use crate::run::run;
@@ -53,12 +54,13 @@ pub fn main(cli: Cli) -> Result<(), Failure> {
         .or_runtime()?;
     watch_signals(&runtime, &shutdown).context("cannot watch for signals").or_runtime()?;
     let result = match command {
-        Command::Run(args) => {
+        Command::Run(mut args) => {
+            locate(&mut args.robot, &shutdown)?;
             run(&args, &shutdown, &terminal).map(|summary| say(&summary.to_string()).unwrap_or_default())
         }
         Command::Calibrate(args) => calibrate::calibrate(&args, &shutdown),
-        Command::Watch(args) => watch_robot(&args, &shutdown),
-        Command::Stop(args) => stop_robot(&args),
+        Command::Watch(args) => watch_robot(args, &shutdown),
+        Command::Stop(args) => stop_robot(args, &shutdown),
         Command::List(args) => list_robots(&args, &shutdown),
         Command::Gestures => {
             gestures();
@@ -119,7 +121,8 @@ fn gestures() {
     }
 }
 
-fn stop_robot(args: &StopArgs) -> Result<(), Failure> {
+fn stop_robot(mut args: StopArgs, shutdown: &Shutdown) -> Result<(), Failure> {
+    locate(&mut args.robot, shutdown)?;
     let keys = Keys::new(&args.robot.name).or_usage()?;
     let epoch = random_epoch();
     let feedback = Arc::new(Feedback::new(epoch));
@@ -134,18 +137,38 @@ fn stop_robot(args: &StopArgs) -> Result<(), Failure> {
 }
 
 fn list_robots(args: &ListArgs, shutdown: &Shutdown) -> Result<(), Failure> {
-    let config = SessionConfig { open_timeout: LINK_TIMEOUT, ..args.link.session(&args.connect) };
+    let time = Duration::from_secs_f64(args.time);
+    let found = match &args.link.lan {
+        None => None,
+        Some(interface) => Some(find(&args.link, interface, shutdown)?),
+    };
+    let connect = found
+        .as_ref()
+        .map_or_else(|| args.connect.clone(), |found| found.iter().map(|(_, endpoint)| endpoint.clone()).collect());
+    if found.is_some() && connect.is_empty() {
+        return show(&[], args.json).or_runtime();
+    }
+    let config = SessionConfig { open_timeout: LINK_TIMEOUT, ..args.link.session(&connect) };
     let session = Session::open(&config).map_err(not_open)?;
-    if list(&session, Duration::from_secs_f64(args.time), args.json, shutdown).or_runtime()? || shutdown.requested() {
+    if let Some(mut rows) = list(&session, connect.len(), time, shutdown).or_runtime()? {
+        for (name, endpoint) in found.into_iter().flatten() {
+            rows.iter_mut()
+                .filter(|row| row.robot == name)
+                .for_each(|row| row.endpoint.clone_from(&Some(endpoint.clone())));
+        }
+        return show(&rows, args.json).or_runtime();
+    }
+    if shutdown.requested() {
         return Ok(());
     }
-    let at = args.connect.join(", ");
+    let at = connect.join(", ");
     Err(Failure::Runtime(anyhow!(
         "nobody answers at {at}: is a robot or a router running there, and is --connect right?"
     )))
 }
 
-fn watch_robot(args: &WatchArgs, shutdown: &Shutdown) -> Result<(), Failure> {
+fn watch_robot(mut args: WatchArgs, shutdown: &Shutdown) -> Result<(), Failure> {
+    locate(&mut args.robot, shutdown)?;
     let keys = Keys::new(&args.robot.name).or_usage()?;
     let feedback = Arc::new(Feedback::new(random_epoch()));
     let _link = RobotLink::open(args.robot.session(), &keys, None, &feedback).map_err(not_open)?;

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
-use teleop_common::net::{SessionConfig, Tls};
+use teleop_common::net::{AUTO_INTERFACE, Role, SessionConfig, Tls, runtime};
 use teleop_common::viz::Viewer;
 
 use crate::pilot::ClutchBy;
@@ -28,6 +28,7 @@ Examples:
   operator watch --json --duration 5             what the robot does, as JSON lines
   operator stop                                  stop the hand, from any terminal; it stays stopped
   operator list                                  robots, what they do and for whom
+  operator list --lan                            those on the local network that were started with --lan
   operator gestures                              what --source knows
 
 The robot follows only while the clutch is closed. On a terminal: SPACE closes and opens the clutch, s stops the hand,
@@ -96,9 +97,14 @@ impl RobotArgs {
 /// Through a router or not, and certificates for quic/ and tls/ endpoints.
 #[derive(Args, Clone, Debug)]
 pub struct LinkArgs {
-    /// --connect names Zenoh routers, which the robot is connected to as well
+    /// --connect names routers (robot router, zenohd), which the robot is connected to as well
     #[arg(long)]
     pub router: bool,
+    /// Look for robots on the local network instead of --connect; those answer that were started with --lan as well.
+    /// Another network interface than the system's choice: --lan=INTERFACE
+    #[arg(long, value_name = "INTERFACE", num_args = 0..=1, require_equals = true, default_missing_value = AUTO_INTERFACE,
+        conflicts_with_all = ["connect", "router"])]
+    pub lan: Option<String>,
     /// Certificate authority (PEM): only a robot that has a certificate of it is connected to
     #[arg(long, value_name = "FILE", requires_all = ["tls_cert", "tls_key"], help_heading = "Security")]
     pub tls_ca: Option<PathBuf>,
@@ -119,7 +125,24 @@ impl LinkArgs {
             }
             _ => None,
         };
-        SessionConfig { router: self.router, tls, ..SessionConfig::connecting(endpoints.iter().cloned()) }
+        let role = if self.router { Role::Client } else { Role::Peer };
+        SessionConfig { role, tls, ..SessionConfig::connecting(endpoints.iter().cloned()) }
+    }
+}
+
+impl Cli {
+    /// Whether zenoh must keep to one thread: there may be `tls/` links.
+    #[must_use]
+    pub fn needs_one_thread(&self) -> bool {
+        let (connect, link) = match self.command.as_ref() {
+            None => (&self.run.robot.connect, &self.run.robot.link),
+            Some(Command::Run(args)) => (&args.robot.connect, &args.robot.link),
+            Some(Command::Watch(args)) => (&args.robot.connect, &args.robot.link),
+            Some(Command::Stop(args)) => (&args.robot.connect, &args.robot.link),
+            Some(Command::List(args)) => (&args.connect, &args.link),
+            Some(Command::Calibrate(_) | Command::Gestures) => return false,
+        };
+        runtime::needs_one_thread(connect) || (link.lan.is_some() && link.tls_ca.is_some())
     }
 }
 

@@ -14,6 +14,8 @@ use teleop_common::wire::{
     Checked, Echo, HealthMessage, JointStateMessage, MappingMessage, Message, REJECTIONS, Rejection, WireError,
 };
 
+use crate::delivery::Delivery;
+
 /// A robot that was silent for this long is not connected.
 pub const SILENCE: Duration = Duration::from_millis(700);
 /// An echo of something older says nothing about now.
@@ -43,6 +45,7 @@ struct State {
     rejection: Option<(Rejection, MonoTime)>,
     former_epoch: Option<u64>,
     rivals: Option<MonoTime>,
+    delivery: Delivery,
     bad: u64,
     first_bad: Option<WireError>,
 }
@@ -74,6 +77,8 @@ pub struct Snapshot {
     pub picture_offset_ns: Option<i64>,
     /// Why the robot does not follow, if it does not.
     pub reason: Option<Reason>,
+    /// How many of the own poses arrive.
+    pub delivery: Delivery,
     /// Messages that were no valid state.
     pub bad: u64,
     /// What was wrong with the first of them.
@@ -208,7 +213,18 @@ impl Feedback {
             }
         }
         state.rejected = Some(rejected);
+        let newest = state.joints.as_ref().map(|heard| heard.message);
+        if let Some(joints) = newest.filter(|joints| [joints.pose_epoch, joints.holder] == [self.epoch; 2]) {
+            let arrived = message.poses_accepted.saturating_add(rejected[Rejection::Sequence.index()]);
+            state.delivery.on_counters(joints.pose_seq, arrived);
+        }
         state.health = Some(Heard { message, at: now });
+    }
+
+    /// How many of the own poses arrive.
+    #[must_use]
+    pub fn delivery(&self) -> Delivery {
+        self.lock().delivery
     }
 
     /// Whether the robot has received a pose sent at or after `sent`.
@@ -260,6 +276,7 @@ impl Feedback {
             clock_offset_ns: estimate.map(|estimate| estimate.offset_ns),
             picture_offset_ns,
             reason: state.reason(self.epoch, now),
+            delivery: state.delivery,
             bad: state.bad,
             first_bad: state.first_bad,
             rivals: state.rivals.is_some_and(|at| now.since(at) < REASON_LASTS),

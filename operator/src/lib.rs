@@ -7,10 +7,12 @@
 //! | [`robot_hand`] | the robot hand that a person's hand is tuned for |
 //! | [`pipeline`] | the source thread: frames in, poses out |
 //! | [`stream`] | the publisher thread behind a latest-value slot |
+//! | [`delivery`] | how many poses get lost, and whether each is sent twice |
 //! | [`feedback`] | the robot as last heard, round trip, clock offset |
 //! | [`robot_link`] | the session with the robot, opened anew when it falls silent |
 //! | [`pilot`] | the clutch: when the robot may follow |
 //! | [`request`] | stops and resets |
+//! | [`lan`] | robots on the local network |
 //! | [`terminal`] | the status line |
 //! | [`record`] | the recording of what is streamed |
 //! | [`run`] | `operator run`: the wiring of the above |
@@ -22,9 +24,11 @@
 pub mod app;
 pub mod calibrate;
 pub mod cli;
+pub mod delivery;
 pub mod failure;
 pub mod feedback;
 pub mod hand;
+pub mod lan;
 pub mod list;
 pub mod pilot;
 pub mod pipeline;

@@ -17,6 +17,8 @@ use crate::terminal::say;
 
 /// Time that a link gets to come about: a handshake over a satellite.
 pub const LINK_TIMEOUT: Duration = Duration::from_secs(5);
+/// Time that the others get once one link is there.
+const GRACE: Duration = Duration::from_millis(1500);
 const LOOK: Duration = Duration::from_millis(20);
 /// Time robots get to show that they are alive.
 const LIVE_TIMEOUT: Duration = Duration::from_secs(1);
@@ -24,9 +26,13 @@ const LIVE_TIMEOUT: Duration = Duration::from_secs(1);
 const MAX_ROBOTS: usize = 64;
 
 /// A robot and what it told.
-#[derive(Debug, Serialize)]
-struct Row {
-    robot: String,
+#[derive(Clone, Debug, Serialize)]
+pub struct Row {
+    /// Name.
+    pub robot: String,
+    /// Where it was found, if it was looked for.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub endpoint: Option<String>,
     mode: Option<&'static str>,
     operator: String,
     latency_ms_p50: Option<f32>,
@@ -35,17 +41,26 @@ struct Row {
     holds: Option<u64>,
 }
 
-/// Prints the robots that `session` reaches, after `time` of listening to them: a table, or a line of JSON each. False
-/// if nobody at all answers.
+/// The robots that `session`, which connects to `links` places, reaches, after `time` of listening to them. `None` if
+/// nobody at all answers.
 ///
 /// # Errors
 /// The session is closed.
-pub fn list(session: &Session, time: Duration, json: bool, shutdown: &Shutdown) -> Result<bool, NetError> {
-    let end = now() + LINK_TIMEOUT;
-    while session.peers() == 0 {
-        if now() > end || shutdown.wait(LOOK) {
-            return Ok(false);
+pub fn list(
+    session: &Session,
+    links: usize,
+    time: Duration,
+    shutdown: &Shutdown,
+) -> Result<Option<Vec<Row>>, NetError> {
+    let begin = now();
+    // Those that answer later than the first get a little more.
+    while session.peers() < links && now().since(begin) < if session.peers() == 0 { LINK_TIMEOUT } else { GRACE } {
+        if shutdown.wait(LOOK) {
+            return Ok(None);
         }
+    }
+    if session.peers() == 0 {
+        return Ok(None);
     }
     let mut robots = BTreeMap::new();
     for key in session.live_now(&Keys::all_live_robots(), LIVE_TIMEOUT)? {
@@ -61,15 +76,17 @@ pub fn list(session: &Session, time: Duration, json: bool, shutdown: &Shutdown) 
     if !robots.is_empty() {
         let _ended = shutdown.wait(time);
     }
-    let rows: Vec<Row> = robots.iter().map(|(name, (feedback, _))| row(name, feedback)).collect();
+    Ok(Some(robots.iter().map(|(name, (feedback, _))| row(name, feedback)).collect()))
+}
+
+/// Prints them: a table, or a line of JSON each.
+///
+/// # Errors
+/// Nobody reads.
+pub fn show(rows: &[Row], json: bool) -> std::io::Result<()> {
     let lines =
-        if json { rows.iter().filter_map(|row| serde_json::to_string(row).ok()).collect() } else { table(&rows) };
-    for line in lines {
-        if say(&line).is_err() {
-            break;
-        }
-    }
-    Ok(true)
+        if json { rows.iter().filter_map(|row| serde_json::to_string(row).ok()).collect() } else { table(rows) };
+    lines.iter().try_for_each(|line| say(line))
 }
 
 fn row(name: &str, feedback: &Feedback) -> Row {
@@ -78,6 +95,7 @@ fn row(name: &str, feedback: &Feedback) -> Row {
     let driven = health.filter(|health| health.total_ms.max > 0.0);
     Row {
         robot: name.to_owned(),
+        endpoint: None,
         mode: snapshot.authority.map(|(mode, _)| Mode::name(mode)),
         operator: health.map(|health| health.operator.to_string()).unwrap_or_default(),
         latency_ms_p50: driven.map(|health| health.total_ms.p50),
@@ -102,13 +120,16 @@ fn table(rows: &[Row]) -> Vec<String> {
             number(row.latency_ms_p99),
             number(row.rate_hz),
             row.holds.map_or_else(|| "-".to_owned(), |holds| holds.to_string()),
+            row.endpoint.clone().unwrap_or_default(),
         ]
     });
-    let heads = ["robot", "mode", "operator", "latency p50 ms", "p99 ms", "control Hz", "holds"].map(str::to_owned);
+    let found = if rows.iter().any(|row| row.endpoint.is_some()) { "endpoint" } else { "" };
+    let heads =
+        ["robot", "mode", "operator", "latency p50 ms", "p99 ms", "control Hz", "holds", found].map(str::to_owned);
     let all: Vec<_> = std::iter::once(heads).chain(cells).collect();
     let width = |column: usize| all.iter().map(|row| row[column].len()).max().unwrap_or(0);
-    let widths: [usize; 7] = std::array::from_fn(width);
-    let line = |row: &[String; 7]| {
+    let widths: [usize; 8] = std::array::from_fn(width);
+    let line = |row: &[String; 8]| {
         let cells: Vec<_> = row.iter().zip(widths).map(|(cell, width)| format!("{cell:<width$}")).collect();
         cells.join("  ").trim_end().to_owned()
     };
@@ -123,6 +144,7 @@ mod tests {
     fn columns_are_as_wide_as_their_longest_cell() {
         let row = |robot: &str, mode| Row {
             robot: robot.to_owned(),
+            endpoint: None,
             mode,
             operator: "ada".to_owned(),
             latency_ms_p50: Some(3.25),
@@ -135,5 +157,8 @@ mod tests {
         assert_eq!(lines[1], "left         engaged  ada       3.2             -       333.0       2");
         assert_eq!(lines[2], "a-long-name  silent   ada       3.2             -       333.0       2");
         assert_eq!(table(&[]), ["no robots"]);
+        let found = Row { endpoint: Some("udp/192.168.0.7:7447".to_owned()), ..row("left", Some("engaged")) };
+        let lines = table(&[found]);
+        assert!(lines[0].ends_with("  endpoint") && lines[1].ends_with("  udp/192.168.0.7:7447"), "{lines:?}");
     }
 }

@@ -16,7 +16,7 @@ use std::time::Duration;
 use teleop_common::key::Keys;
 use teleop_common::net::clock::now;
 use teleop_common::net::{LiveToken, NetError, Publisher, Session, SessionConfig, Stream, Subscriber};
-use teleop_common::wire::{ControlMessage, PoseMessage};
+use teleop_common::wire::{ControlMessage, PoseMessage, Request};
 
 use self::redial::{Redial, SHORTEST, Signs, Step};
 use crate::feedback::Feedback;
@@ -28,7 +28,8 @@ const LOOK: Duration = Duration::from_millis(50);
 struct Connected {
     session: Session,
     poses: Publisher,
-    control: Publisher,
+    stops: Publisher,
+    resets: Publisher,
     _token: Option<LiveToken>,
     subscribers: Option<[Subscriber; 3]>,
 }
@@ -38,7 +39,8 @@ impl Connected {
         let session = Session::open(config)?;
         Ok(Self {
             poses: session.publisher(&keys.pose(), Stream::Command)?,
-            control: session.publisher(&keys.control(), Stream::Slow)?,
+            stops: session.publisher(&keys.stop(), Stream::Slow)?,
+            resets: session.publisher(&keys.reset(), Stream::Slow)?,
             _token: own.map(|epoch| session.live_token(&keys.live_operator(epoch))).transpose()?,
             subscribers: Some(hear(&session, keys, feedback)?),
             session,
@@ -150,12 +152,15 @@ impl RobotSender {
         self.0.lock().as_ref().map_or(Ok(()), |connected| connected.poses.send(message))
     }
 
-    /// Sends a request.
+    /// Sends a request, on the key that it belongs to.
     ///
     /// # Errors
     /// As for a pose.
     pub fn control(&self, message: &ControlMessage) -> Result<(), NetError> {
-        self.0.lock().as_ref().map_or(Ok(()), |connected| connected.control.send(message))
+        self.0.lock().as_ref().map_or(Ok(()), |connected| match message.request() {
+            Some(Request::Reset { .. }) => connected.resets.send(message),
+            _ => connected.stops.send(message),
+        })
     }
 }
 

@@ -18,6 +18,9 @@ use crate::robot_link::RobotSender;
 
 /// How often the publisher looks whether it should end.
 const LOOK: Duration = Duration::from_millis(100);
+/// Latest that the copy of a pose is sent, where each is sent twice: half the longest period that the robot's watchdog
+/// allows for.
+const LONGEST_HALF: Duration = Duration::from_millis(50);
 /// How often it says that it leaves.
 const FAREWELLS: u32 = 3;
 const FAREWELL_EVERY: Duration = Duration::from_millis(5);
@@ -73,18 +76,30 @@ impl PoseStream {
         let thread = std::thread::Builder::new().name("publisher".to_owned()).spawn(move || {
             let mut stamper = Stamper::new(epoch);
             let mut last = None;
+            let mut copy: Option<(PoseMessage, MonoTime)> = None;
             while !stopped.load(Ordering::Acquire) {
                 let news = if poses.update() { *poses.output_buffer() } else { None };
                 let Some(outgoing) = news else {
-                    std::thread::park_timeout(LOOK);
+                    let due = copy.as_ref().map(|(_, due)| due.since(now()));
+                    if due == Some(Duration::ZERO)
+                        && let Some((message, _)) = copy.take()
+                    {
+                        // That it fails was told when the first of the two did.
+                        sender.pose(&message).ok();
+                    } else {
+                        std::thread::park_timeout(due.unwrap_or(LOOK));
+                    }
                     continue;
                 };
                 last = Some(outgoing);
                 pilot.step(now(), feedback.snapshot(now()).authority);
                 match send(&sender, &mut stamper, &feedback, &outgoing, pilot.intent()) {
-                    Ok(sent) => {
+                    Ok(message) => {
+                        let sent = message.header.sent;
                         count.sent.fetch_add(1, Ordering::Relaxed);
-                        count.last_sent.store(sent.0, Ordering::Release);
+                        let before = MonoTime(count.last_sent.swap(sent.0, Ordering::AcqRel));
+                        let half = (sent.since(before) / 2).min(LONGEST_HALF);
+                        copy = feedback.delivery().twice().then(|| (message, sent + half));
                     }
                     Err(error) => {
                         // Told once: a stream that fails does so at every pose.
@@ -139,11 +154,12 @@ fn send(
     feedback: &Feedback,
     outgoing: &Outgoing,
     intent: Intent,
-) -> Result<MonoTime, NetError> {
+) -> Result<PoseMessage, NetError> {
     let sent = now();
     // Before the pose is on its way, or its echo could come back first.
     feedback.on_sent(sent);
     let header = stamper.header::<PoseMessage>(sent);
-    sender.pose(&PoseMessage::new(header, feedback.echo(sent), outgoing.captured, &outgoing.pose, intent))?;
-    Ok(sent)
+    let message = PoseMessage::new(header, feedback.echo(sent), outgoing.captured, &outgoing.pose, intent);
+    sender.pose(&message)?;
+    Ok(message)
 }

@@ -83,6 +83,9 @@ pub fn status_line(status: &Status) -> String {
     {
         part(format!("pose age at robot {:.1} ms (p99)", health.age_ms.p99));
     }
+    if robot.connected && robot.delivery.twice() {
+        part(format!("{:.0} % lost, sent twice", 100.0 * robot.delivery.lost()));
+    }
     if let Some(residual) = progress.residual {
         part(format!("fit {:.1} mm", residual * 1e3));
     }

@@ -15,7 +15,7 @@ use teleop_common::net::{Session, clock};
 use teleop_common::viz::{Hub, HubOptions, Scene, Viz};
 use teleop_common::wire;
 
-use crate::cli::{Cli, Command, LogArgs, RunArgs, ViewerArgs};
+use crate::cli::{Cli, Command, LogArgs, RouterArgs, RunArgs, ViewerArgs};
 use crate::config::{Config, ConfigError};
 use crate::control::Controller;
 use crate::driver::SimHand;
@@ -36,12 +36,14 @@ pub fn main(cli: Cli) -> ExitCode {
         Command::Retarget(args) => &args.log,
         Command::Paper(args) => &args.log,
         Command::Viewer(args) => &args.log,
+        Command::Router(args) => &args.log,
     };
     let result = start_logging(log).and_then(|()| match command {
         Command::Run(args) => run(&args),
         Command::Retarget(args) => crate::retarget::run(&args),
         Command::Paper(args) => crate::paper::run(&args),
         Command::Viewer(args) => view(&args),
+        Command::Router(args) => route(&args),
     });
     match result {
         Ok(()) => ExitCode::SUCCESS,
@@ -147,6 +149,14 @@ fn view(args: &ViewerArgs) -> anyhow::Result<()> {
     let hub = Hub::open(&HubOptions { bind: args.bind, ..HubOptions::default() })?;
     tracing::info!("viewer: open {} in a browser; processes connect with --viewer connect=HOST", hub.page());
     wait_for_the_end(None, || true, None)
+}
+
+fn route(args: &RouterArgs) -> anyhow::Result<()> {
+    let session = Session::open(&args.session())?;
+    tracing::info!("router: robots and operators connect to {}", session.locators().join(", "));
+    wait_for_the_end(None, || true, None)?;
+    session.close()?;
+    Ok(())
 }
 
 /// Blocks until Ctrl-C, SIGTERM, the end of `duration` seconds, or `alive` turning false. Meanwhile SIGUSR1 stops the

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use teleop_common::hand::HandSide;
 use teleop_common::mapping::MappingMode;
-use teleop_common::net::{Access, SessionConfig, Tls};
+use teleop_common::net::{AUTO_INTERFACE, Access, Role, SessionConfig, Tls, runtime};
 use teleop_common::viz::Viewer;
 
 use crate::config::{HandSource, Overrides};
@@ -16,6 +16,7 @@ Examples:
   robot                                     a simulated right Allegro Hand on this machine, picture in the browser
   robot --hand left --name lefty            the left hand, under another name
   robot --listen tcp/0.0.0.0:7447           let an operator on another machine connect
+  robot --listen udp/0.0.0.0:7447 --lan     the same, and operators on the local network find it (operator --lan)
   robot --listen quic/0.0.0.0:7447 --tls-ca ca.pem --tls-cert robot.pem --tls-key robot.key --allow-operator ada
                                             over the internet, for the operator whose certificate says ada (files: see
                                             deploy/certificates; which link for which network: deploy/NETWORK.md)
@@ -62,6 +63,18 @@ Examples:
   robot paper --out paper
   robot paper --out left --hand left --preset default";
 
+const ROUTER: &str = "\
+Robots and operators both connect to it, with certificates of the same authority. Who may pass what is said here, because a
+robot sees this router's certificate on all that comes from it, and names only that.
+
+Examples:
+  robot router --listen quic/0.0.0.0:7447 --tls-ca ca.pem --tls-cert router.pem --tls-key router.key \\
+               --allow-robot robot --allow-operator ada --allow-observer olga
+  robot    --listen quic/127.0.0.1:7447 --connect quic/router.example.org:7447 ... --allow-operator router
+  operator --router --connect quic/router.example.org:7447 ...
+
+Without --allow-... whoever gets a link may do everything. It is a Zenoh router (what zenohd is, without plugins).";
+
 /// Drives a robot hand with the poses of a human hand.
 #[derive(Debug, Parser)]
 #[command(name = "robot", version, after_help = EXAMPLES, args_conflicts_with_subcommands = true)]
@@ -87,6 +100,27 @@ pub enum Command {
     Paper(PaperArgs),
     /// Host the viewer for other processes (--viewer connect=HOST) and nothing else
     Viewer(ViewerArgs),
+    /// Pass on what robots and operators send that cannot reach each other, and nothing else
+    #[command(after_help = ROUTER)]
+    Router(RouterArgs),
+}
+
+impl Cli {
+    /// Whether zenoh must keep to one thread: there may be `tls/` links.
+    #[must_use]
+    pub fn needs_one_thread(&self) -> bool {
+        let args = match &self.command {
+            None => &self.run,
+            Some(Command::Run(args)) => args,
+            Some(Command::Router(args)) => {
+                return runtime::needs_one_thread(args.listen.iter().chain(&args.connect));
+            }
+            Some(Command::Retarget(_) | Command::Paper(_) | Command::Viewer(_)) => return false,
+        };
+        // What a zenoh configuration says shows only when it is read.
+        let NetworkArgs { listen, connect, zenoh, .. } = &args.network;
+        zenoh.is_some() || runtime::needs_one_thread(listen.iter().chain(connect))
+    }
 }
 
 /// Which hand.
@@ -157,13 +191,26 @@ pub struct NetworkArgs {
     /// A router to connect to, over which operators reach this robot; repeatable
     #[arg(long, value_name = "ENDPOINT", help_heading = "Network")]
     pub connect: Vec<String>,
+    /// Answer operators that look for robots on the local network (operator list --lan), which tells anybody there where
+    /// this robot listens. Another network interface than the system's choice: --lan=INTERFACE
+    #[arg(long, value_name = "INTERFACE", num_args = 0..=1, require_equals = true, default_missing_value = AUTO_INTERFACE,
+        help_heading = "Network")]
+    pub lan: Option<String>,
     /// A zenoh configuration file for link options
     #[arg(long, value_name = "FILE", help_heading = "Network")]
     pub zenoh: Option<PathBuf>,
+    /// Certificates, and who may do what.
+    #[command(flatten)]
+    pub security: SecurityArgs,
+}
+
+/// Certificates, and who may do what.
+#[derive(Args, Clone, Debug)]
+pub struct SecurityArgs {
     /// Certificate authority (PEM): only who has a certificate of it can connect
     #[arg(long, value_name = "FILE", requires_all = ["tls_cert", "tls_key"], help_heading = "Security")]
     pub tls_ca: Option<PathBuf>,
-    /// This robot's certificate (PEM), with the names that operators connect to
+    /// This process's certificate (PEM), with the names that others connect to
     #[arg(long, value_name = "FILE", requires_all = ["tls_ca", "tls_key"], help_heading = "Security")]
     pub tls_cert: Option<PathBuf>,
     /// The certificate's private key (PEM)
@@ -178,23 +225,34 @@ pub struct NetworkArgs {
     pub allow_observer: Vec<String>,
 }
 
-impl NetworkArgs {
-    /// The session with operators.
-    #[must_use]
-    pub fn session(&self) -> SessionConfig {
-        let tls = match (&self.tls_ca, &self.tls_cert, &self.tls_key) {
+impl SecurityArgs {
+    fn tls(&self) -> Option<Tls> {
+        match (&self.tls_ca, &self.tls_cert, &self.tls_key) {
             (Some(ca), Some(certificate), Some(key)) => {
                 Some(Tls { ca: ca.clone(), certificate: certificate.clone(), key: key.clone() })
             }
             _ => None,
-        };
-        let access = Access { operators: self.allow_operator.clone(), observers: self.allow_observer.clone() };
+        }
+    }
+
+    fn access(&self) -> Access {
+        let (operators, observers) = (self.allow_operator.clone(), self.allow_observer.clone());
+        Access { operators, observers, ..Access::default() }
+    }
+}
+
+impl NetworkArgs {
+    /// The session with operators.
+    #[must_use]
+    pub fn session(&self) -> SessionConfig {
+        let access = self.security.access();
         SessionConfig {
             listen: self.listen.clone(),
             connect: self.connect.clone(),
-            tls,
+            tls: self.security.tls(),
             access: (access != Access::default()).then_some(access),
             zenoh_config_file: self.zenoh.clone(),
+            lan: self.lan.clone(),
             ..SessionConfig::default()
         }
     }
@@ -291,6 +349,46 @@ pub struct ViewerArgs {
     /// Logging.
     #[command(flatten)]
     pub log: LogArgs,
+}
+
+/// Options of `robot router`.
+#[derive(Args, Clone, Debug)]
+pub struct RouterArgs {
+    /// Where robots, operators and other routers connect; repeatable
+    #[arg(long, default_value = "tcp/127.0.0.1:7447", value_name = "ENDPOINT", help_heading = "Network")]
+    pub listen: Vec<String>,
+    /// Another router to connect to; repeatable
+    #[arg(long, value_name = "ENDPOINT", help_heading = "Network")]
+    pub connect: Vec<String>,
+    /// Certificates, and who may do what.
+    #[command(flatten)]
+    pub security: SecurityArgs,
+    /// Common name of a certificate that is a robot's; repeatable
+    #[arg(long, value_name = "NAME", value_parser = common_name, help_heading = "Security")]
+    pub allow_robot: Vec<String>,
+    /// Common name of a certificate that is another router's, which may pass on what anybody may; repeatable
+    #[arg(long, value_name = "NAME", value_parser = common_name, help_heading = "Security")]
+    pub allow_router: Vec<String>,
+    /// Logging.
+    #[command(flatten)]
+    pub log: LogArgs,
+}
+
+impl RouterArgs {
+    /// The session that passes everything on.
+    #[must_use]
+    pub fn session(&self) -> SessionConfig {
+        let (robots, routers) = (self.allow_robot.clone(), self.allow_router.clone());
+        let access = Access { robots, routers, ..self.security.access() };
+        SessionConfig {
+            listen: self.listen.clone(),
+            connect: self.connect.clone(),
+            role: Role::Router,
+            tls: self.security.tls(),
+            access: (access != Access::default()).then_some(access),
+            ..SessionConfig::default()
+        }
+    }
 }
 
 fn threads(text: &str) -> Result<usize, String> {

@@ -5,5 +5,10 @@ use std::process::ExitCode;
 use clap::Parser as _;
 
 fn main() -> ExitCode {
-    teleop_robot::app::main(teleop_robot::cli::Cli::parse())
+    let cli = teleop_robot::cli::Cli::parse();
+    if cli.needs_one_thread() {
+        // SAFETY: this is the only thread so far.
+        unsafe { teleop_common::net::runtime::use_one_thread() };
+    }
+    teleop_robot::app::main(cli)
 }

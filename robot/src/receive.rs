@@ -4,7 +4,7 @@
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
-use teleop_common::authority::{Claim, Lease, LeaseParams, OperatorName, StopLatch};
+use teleop_common::authority::{Claim, Lease, LeaseParams, OperatorName};
 use teleop_common::key::Keys;
 use teleop_common::net::{Arrival, NetError, Session, Subscriber, clock};
 use teleop_common::time::{ClockOffset, Histogram, MonoTime};
@@ -15,6 +15,9 @@ use crate::runtime::Shared;
 
 /// Operators whose clocks are known at the same time: the one that drives and others that try to.
 const CLOCKS: usize = 4;
+
+/// What is older than the newest pose by no more than this was doubled or overtaken on the way.
+const OVERTAKEN: Duration = Duration::from_secs(1);
 
 /// Judges arriving poses. Lives behind a mutex on the network's side; the control thread never touches it.
 pub struct Receiver {
@@ -83,18 +86,23 @@ impl Receiver {
         self.lease.holder(now).map(|epoch| (epoch, self.operator))
     }
 
-    /// Takes what arrived on the control key.
-    pub fn on_control(&mut self, arrival: Arrival<'_>) {
+    /// Takes what arrived on the key of stops: from anybody and however old, to hold still is never wrong.
+    pub fn on_stop(&mut self, arrival: Arrival<'_>) {
         let Ok(message) = arrival.decode::<ControlMessage>() else { return };
-        let latch: &StopLatch = &self.shared.latch;
+        if message.request() == Some(Request::Stop) && self.shared.latch.stop() {
+            tracing::warn!("stop: asked for over the network");
+        }
+    }
+
+    /// Takes what arrived on the key of resets, where only who may drive can write.
+    pub fn on_reset(&mut self, arrival: Arrival<'_>) {
+        let Ok(message) = arrival.decode::<ControlMessage>() else { return };
         let meant = message.robot == self.epoch && self.lease.holder(arrival.at) == Some(message.header.epoch);
-        match message.request() {
-            // From anybody and however old: to hold still is never wrong.
-            Some(Request::Stop) if latch.stop() => tracing::warn!("stop: asked for over the network"),
-            Some(Request::Reset { stop }) if meant && latch.reset(stop) => {
-                tracing::warn!("stop {stop}: reset by the operator {:?}", self.operator.as_str());
-            }
-            _ => {}
+        if let Some(Request::Reset { stop }) = message.request()
+            && meant
+            && self.shared.latch.reset(stop)
+        {
+            tracing::warn!("stop {stop}: reset by the operator {:?}", self.operator.as_str());
         }
     }
 
@@ -119,15 +127,21 @@ impl Receiver {
     fn judge(&mut self, message: &Checked<PoseMessage>, now: MonoTime) -> Result<PoseSample, Rejection> {
         let header = &message.header;
         let intent = message.intent();
+        // A copy, or what was overtaken, would make the round trip look longer than it is.
+        // Only just so: a false stamp of the far future must not silence the true ones.
+        let same = self.echo.epoch == header.epoch && header.sent <= self.echo.sent;
+        let newer = !same || self.echo.sent.since(header.sent) > OVERTAKEN;
         if self.lease.is_open_to(now, header.epoch) {
-            self.echo = Echo::of(header, now);
+            if newer {
+                self.echo = Echo::of(header, now);
+            }
         } else if !intent.takeover {
             return Err(Rejection::Operator);
         }
         let own_epoch = self.epoch;
         let holder = self.lease.holder(now);
         let clock = self.clock(header.epoch, holder);
-        if let Some(exchange) = message.echo.exchange(own_epoch, header, now) {
+        if let Some(exchange) = message.echo.exchange(own_epoch, header, now).filter(|_| newer) {
             // An exchange that makes no sense leaves the estimate as it was.
             clock.update(header.epoch, exchange).ok();
         }
@@ -186,7 +200,7 @@ pub struct PoseSubscription {
     session: Session,
     keys: Keys,
     receiver: Arc<Mutex<Receiver>>,
-    subscribers: Option<[Subscriber; 2]>,
+    subscribers: Option<[Subscriber; 3]>,
     declared: MonoTime,
 }
 
@@ -224,8 +238,11 @@ impl PoseSubscription {
                 take(&mut receiver.lock().unwrap_or_else(PoisonError::into_inner), arrival);
             })
         };
-        let poses = subscribe(&self.keys.pose(), Receiver::on_pose)?;
-        self.subscribers = Some([poses, subscribe(&self.keys.control(), Receiver::on_control)?]);
+        self.subscribers = Some([
+            subscribe(&self.keys.pose(), Receiver::on_pose)?,
+            subscribe(&self.keys.stop(), Receiver::on_stop)?,
+            subscribe(&self.keys.reset(), Receiver::on_reset)?,
+        ]);
         Ok(())
     }
 }
@@ -293,6 +310,25 @@ mod tests {
     }
 
     #[test]
+    fn a_copy_changes_nothing_and_a_false_stamp_does_no_harm() {
+        let (mut receiver, mut slot) = receiver();
+        send(&mut receiver, 7, 1, 1000, true);
+        let echo = receiver.echo();
+        let pose = MasterPose { q: Gesture::Open.sample(0.0), geometry: MasterGeometry::PARADIGMATIC, tuning: None };
+        let message = |seq, at: u64| {
+            let at = MonoTime(AHEAD + at * MS);
+            PoseMessage::new(Header::new::<PoseMessage>(7, seq, at), Echo::NONE, at, &pose, Intent::default())
+        };
+        deliver(&mut receiver, &message(1, 1000), 1015);
+        assert_eq!((receiver.echo(), rejected(&receiver, Rejection::Sequence)), (echo, 1));
+        // Hours ahead: refused, and the next true one is heard all the same.
+        deliver(&mut receiver, &message(2, 9_000_000), 1016);
+        send(&mut receiver, 7, 3, 1010, true);
+        assert_eq!(receiver.echo().sent, MonoTime(AHEAD + 1010 * MS));
+        assert_eq!([slot.pop().unwrap().sequence, slot.pop().unwrap().sequence], [1, 3]);
+    }
+
+    #[test]
     fn a_backlog_and_a_second_operator_are_refused() {
         let (mut receiver, mut slot) = receiver();
         send(&mut receiver, 7, 1, 1000, true);
@@ -336,7 +372,11 @@ mod tests {
         let message = ControlMessage::new(Header::new::<ControlMessage>(epoch, 1, MonoTime(at)), robot, request);
         let mut buffer = [0; MAX_MESSAGE];
         let len = encode_into(&message, &mut buffer).unwrap();
-        receiver.on_control(Arrival { payload: Ok(&buffer[..len]), at: MonoTime(at * MS) });
+        let arrival = Arrival { payload: Ok(&buffer[..len]), at: MonoTime(at * MS) };
+        match request {
+            Request::Stop => receiver.on_stop(arrival),
+            Request::Reset { .. } => receiver.on_reset(arrival),
+        }
         receiver.shared.latch.get().is_stopped()
     }
 
@@ -351,8 +391,19 @@ mod tests {
         assert!(!ask(&mut receiver, 7, ROBOT, Request::Reset { stop: 1 }, 1104));
         assert!(ask(&mut receiver, 99, 0, Request::Stop, 1105));
         assert!(ask(&mut receiver, 7, ROBOT, Request::Reset { stop: 1 }, 1106), "a replay");
-        receiver.on_control(Arrival { payload: Ok(b"nonsense"), at: MonoTime(1107 * MS) });
+        for take in [Receiver::on_stop, Receiver::on_reset] {
+            take(&mut receiver, Arrival { payload: Ok(b"nonsense"), at: MonoTime(1107 * MS) });
+        }
         assert!(receiver.shared.latch.get().is_stopped());
+        // On the key where an observer may write a reset is none, whoever's it claims to be.
+        let header = Header::new::<ControlMessage>(7, 1, MonoTime(1108));
+        let mut buffer = [0; MAX_MESSAGE];
+        let len = encode_into(&ControlMessage::new(header, ROBOT, Request::Reset { stop: 2 }), &mut buffer).unwrap();
+        let forged = Arrival { payload: Ok(&buffer[..len]), at: MonoTime(1108 * MS) };
+        receiver.on_stop(forged);
+        assert!(receiver.shared.latch.get().is_stopped());
+        receiver.on_reset(forged);
+        assert!(!receiver.shared.latch.get().is_stopped(), "the same from who may");
     }
 
     #[test]

@@ -4,7 +4,7 @@
 
 use std::io::{BufRead, BufReader, Read};
 use std::net::TcpListener;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Output, Stdio};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::JoinHandle;
@@ -23,6 +23,35 @@ pub fn binary(name: &str) -> PathBuf {
     let path = test.ancestors().nth(2).unwrap().join(name);
     assert!(path.is_file(), "{} is missing: run `cargo build --release` first", path.display());
     path
+}
+
+/// The binary `name`, whose wall clock goes wrong by as many seconds as `file` says (such as `+3600`), whenever that is
+/// written. Its monotonic clock stays right.
+///
+/// # Panics
+/// Without libfaketime (Debian's package `faketime`, which `deploy/setup --test` installs).
+#[must_use]
+pub fn with_clock(name: &str, file: &Path) -> Command {
+    let library = std::fs::read_dir("/usr/lib")
+        .unwrap()
+        .flatten()
+        .map(|entry| entry.path().join("faketime/libfaketimeMT.so.1"))
+        .find(|path| path.is_file());
+    let mut command = Command::new(binary(name));
+    command.env("LD_PRELOAD", library.expect("libfaketime is missing: deploy/setup --test installs it"));
+    command.env("FAKETIME_TIMESTAMP_FILE", file).env("FAKETIME_NO_CACHE", "1");
+    command.env("FAKETIME_DONT_FAKE_MONOTONIC", "1").env("DONT_FAKE_MONOTONIC", "1");
+    command
+}
+
+/// The binary `name` on a disk that takes no file of more than `kib` KiB: from there on writes fail, as on a full disk.
+#[must_use]
+pub fn with_full_disk(name: &str, kib: u32) -> Command {
+    let mut command = Command::new("bash");
+    // Without the signal, whose default is to end the process: a full disk sends none.
+    let script = format!("trap '' XFSZ; ulimit -f {kib}; exec \"$@\"");
+    command.args(["-c", &script, "bash"]).arg(binary(name));
+    command
 }
 
 /// A TCP endpoint on this machine that nobody listens on now.
@@ -126,11 +155,21 @@ impl Process {
     /// If it is not there or cannot be started.
     #[must_use]
     pub fn start(name: &str, arguments: &[&str]) -> Self {
-        let mut command = Command::new(binary(name));
-        command.args(arguments).env_remove("RUST_LOG");
+        Self::spawn(Command::new(binary(name)), arguments)
+    }
+
+    /// Starts a command that is a binary in some environment, such as [`with_clock`] and [`with_full_disk`] make.
+    ///
+    /// # Panics
+    /// If it is not there or cannot be started.
+    #[must_use]
+    pub fn spawn(mut command: Command, arguments: &[&str]) -> Self {
+        // What tests set for zenoh inside themselves is not for the binaries.
+        command.args(arguments).env_remove("RUST_LOG").env_remove("ZENOH_RUNTIME");
         command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
         let mut child = command.spawn().unwrap();
         let (stdout, stderr) = (Text::read(child.stdout.take().unwrap()), Text::read(child.stderr.take().unwrap()));
+        let name = command.get_program().to_string_lossy().into_owned();
         Self { name: format!("{name} {}", arguments.join(" ")), child, stdout, stderr }
     }
 
@@ -138,10 +177,16 @@ impl Process {
     /// robot is ready.
     #[must_use]
     pub fn operator(endpoint: &str, source: &str, more: &[&str]) -> Self {
+        Self::operator_by(Command::new(binary("operator")), endpoint, source, more)
+    }
+
+    /// The same, started by this command.
+    #[must_use]
+    pub fn operator_by(command: Command, endpoint: &str, source: &str, more: &[&str]) -> Self {
         let mut arguments =
             vec!["run", "--viewer", "off", "--clutch", "auto", "--connect", endpoint, "--source", source];
         arguments.extend(more);
-        Self::start("operator", &arguments)
+        Self::spawn(command, &arguments)
     }
 
     /// Everything it has written to standard output so far.
@@ -264,13 +309,22 @@ impl Robot {
     /// If it is not ready soon.
     #[must_use]
     pub fn listening(endpoints: &[&str], more: &[&str]) -> Self {
+        Self::listening_by(Command::new(binary("robot")), endpoints, more)
+    }
+
+    /// The same, started by this command.
+    ///
+    /// # Panics
+    /// If it is not ready soon.
+    #[must_use]
+    pub fn listening_by(command: Command, endpoints: &[&str], more: &[&str]) -> Self {
         let mut arguments = vec!["run"];
         if !more.contains(&"--viewer") {
             arguments.extend(["--viewer", "off"]);
         }
         arguments.extend(endpoints.iter().flat_map(|endpoint| ["--listen", *endpoint]));
         arguments.extend(more);
-        let mut process = Process::start("robot", &arguments);
+        let mut process = Process::spawn(command, &arguments);
         let mut found = Vec::new();
         eventually("the robot says where it listens", || {
             let log = process.stderr();

@@ -9,13 +9,16 @@
 
 #![allow(clippy::unwrap_used, reason = "helpers of tests")]
 
+use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use teleop_common::hand::{HandModel, HandSide, JointVector};
 use teleop_common::master::Gesture;
 use teleop_common::mode::Mode;
 use teleop_common::net::clock::now;
+use teleop_common::net::{Session, SessionConfig, Stream};
 use teleop_common::time::MonoTime;
+use teleop_common::wire::Rejection;
 use teleop_link::{Endpoint, Impairment, Link, Profile, Relay};
 use teleop_tests::certificates::Certificates;
 use teleop_tests::eventually;
@@ -188,6 +191,48 @@ fn many_outages() {
     });
 }
 
+/// How long zenoh alone takes to send again over UDP after an outage of 3 s, with this timeout of a handshake, s.
+fn zenoh_sends_again_after(open_timeout: Duration) -> f64 {
+    let listener = Session::open(&SessionConfig::listening(["udp/127.0.0.1:0"])).unwrap();
+    let target: Endpoint = listener.locators()[0].parse().unwrap();
+    let relay = Relay::start(&"udp/127.0.0.1:0".parse().unwrap(), &target, &Link::default(), 1).unwrap();
+    let last = Arc::new(Mutex::new(MonoTime(0)));
+    let heard = Arc::clone(&last);
+    let _ear = listener.subscribe("test", move |arrival| *heard.lock().unwrap() = arrival.at).unwrap();
+    let far = format!("udp/{}", relay.address());
+    let config = SessionConfig { open_timeout, ..SessionConfig::connecting([far]) };
+    let session = Session::open(&config).unwrap();
+    let publisher = session.publisher("test", Stream::Command).unwrap();
+    let send = |condition: &dyn Fn() -> bool| {
+        while !condition() {
+            publisher.put(&[0; 300]).unwrap();
+            std::thread::sleep(Duration::from_millis(10));
+        }
+    };
+    let newest = || *last.lock().unwrap();
+    send(&|| newest() > MonoTime(0));
+    relay.blackout(true);
+    let end = now() + Duration::from_secs(3);
+    send(&|| now() > end);
+    relay.blackout(false);
+    let end = now();
+    send(&|| newest() > end || now().since(end) > Duration::from_secs(30));
+    newest().since(end).as_secs_f64()
+}
+
+/// Why a plain zenoh session is gone for some ten seconds after an outage over UDP: a handshake whose first packet was lost
+/// is not tried again before its timeout, which is 10 s unless configured.
+#[test]
+#[ignore = "takes a minute: a measurement"]
+fn a_lost_handshake_blocks_the_next_for_its_timeout() {
+    println!("| timeout of a handshake s | poses again after s |\n|---|---|");
+    for timeout in [10.0, 5.0, 2.0, 0.6] {
+        let after = zenoh_sends_again_after(Duration::from_secs_f64(timeout));
+        println!("| {timeout} | {after:.2} |");
+        assert!(after <= timeout + 1.0, "{after} s");
+    }
+}
+
 /// Time from the operator's start until the robot is armed, s.
 fn armed_after(loss: f64, seed: u64) -> f64 {
     let pair = Pair::start("udp", Impairment { loss, ..Impairment::default() }, seed);
@@ -268,7 +313,20 @@ impl Reference {
 
 #[test]
 fn a_third_of_all_packets_may_get_lost_without_a_hold() {
-    let pair = Pair::start("udp", Link::default(), 30);
+    third_lost(30);
+}
+
+/// Once may be luck.
+#[test]
+#[ignore = "takes minutes: a measurement"]
+fn a_third_of_all_packets_may_get_lost_again_and_again() {
+    for seed in 31..41 {
+        third_lost(seed);
+    }
+}
+
+fn third_lost(seed: u64) {
+    let pair = Pair::start("udp", Link::default(), seed);
     pair.probe.wait_for(Mode::Engaged);
     let period = Gesture::Wave.duration();
     // Until it has caught up with the operator; then what a good link does.
@@ -297,9 +355,10 @@ fn a_third_of_all_packets_may_get_lost_without_a_hold() {
         1e3 * rms,
         1e3 * most
     );
-    // Ten losses in a row are a hold, and happen once in some hundred thousand packets; a busy machine adds its own.
+    // Ten losses in a row are a hold: some every few minutes, if the operator did not send each pose twice.
     let holds = pair.probe.health().unwrap().holds - health.holds;
-    assert!(holds <= 1, "{holds} holds");
+    assert_eq!(holds, 0);
+    assert!(pair.probe.rejected(Rejection::Sequence) > 100, "no copies came");
     // The wave moves joints by a radian; a hand that lost its way would be off by tenths.
-    assert!(holds > 0 || rms < 0.1, "{rms} rad off at a delay of {delay} s");
+    assert!(rms < 0.1, "{rms} rad off at a delay of {delay} s");
 }

@@ -16,7 +16,6 @@ use teleop_common::authority::{LeaseParams, OperatorName, Takeover};
 use teleop_common::hand::{HandModel, HandSide, JointVector};
 use teleop_common::mapping::{MappingParams, Retargeter};
 use teleop_common::master::{Gesture, MasterGeometry, MasterPose};
-use teleop_common::mode::Mode;
 use teleop_common::net::Arrival;
 use teleop_common::time::{Histogram, MonoTime};
 use teleop_common::wire::{JointStateMessage, MAX_MESSAGE, Message, PoseMessage, Stamper, encode_into, pack_joints};

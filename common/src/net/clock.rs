@@ -1,23 +1,25 @@
 //! The clocks of this process.
 
 use std::hash::{BuildHasher, Hasher, RandomState};
+use std::time::{SystemTime, UNIX_EPOCH};
 
-use rustix::time::{ClockId, Timespec, clock_gettime};
+use rustix::time::{ClockId, clock_gettime};
 
 use crate::time::MonoTime;
 
 /// Now, by `CLOCK_MONOTONIC`: the same clock in all processes of a host, stopped while the host is suspended.
 #[must_use]
 pub fn now() -> MonoTime {
-    MonoTime(u64::try_from(nanoseconds(&clock_gettime(ClockId::Monotonic))).unwrap_or(0))
+    let time = clock_gettime(ClockId::Monotonic);
+    MonoTime(u64::try_from(i128::from(time.tv_sec) * 1_000_000_000 + i128::from(time.tv_nsec)).unwrap_or(0))
 }
 
 /// UNIX time minus monotonic time, ns: labels recordings and log lines; it jumps when the wall clock is set.
 #[must_use]
 pub fn wall_offset_ns() -> i64 {
-    let before = nanoseconds(&clock_gettime(ClockId::Monotonic));
-    let wall = nanoseconds(&clock_gettime(ClockId::Realtime));
-    let after = nanoseconds(&clock_gettime(ClockId::Monotonic));
+    let before = i128::from(now().0);
+    let wall = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |wall| wall.as_nanos() as i128);
+    let after = i128::from(now().0);
     i64::try_from(wall - before - (after - before) / 2).unwrap_or(0)
 }
 
@@ -26,10 +28,6 @@ pub fn wall_offset_ns() -> i64 {
 pub fn random_epoch() -> u64 {
     // The standard library seeds its hash maps from the operating system.
     RandomState::new().build_hasher().finish().max(1)
-}
-
-fn nanoseconds(time: &Timespec) -> i128 {
-    i128::from(time.tv_sec) * 1_000_000_000 + i128::from(time.tv_nsec)
 }
 
 #[cfg(test)]

@@ -5,6 +5,7 @@ use zenoh::Config;
 use zenoh::config::EndPoint;
 
 use super::error::words;
+use super::scout::set_interface;
 use super::{Access, NetError, Tls};
 
 /// Silence after which a link counts as dead. zenoh closes it then, and what an outage kept in buffers is lost with
@@ -23,6 +24,20 @@ const PROTOCOLS: [&str; 4] = ["tcp", "udp", "tls", "quic"];
 /// Longest message zenoh may put together from fragments, bytes.
 const MAX_MESSAGE_SIZE: usize = 65_536;
 
+/// What a process is among others.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Role {
+    /// It is reached by others, or reaches them, directly.
+    #[default]
+    Peer,
+    /// The endpoints to connect to are routers, and one that does not answer within 3 s is an error. Between two peers of
+    /// one router zenoh passes nothing on, because it expects them to reach each other; so of robot and operator one, the
+    /// operator, has to be a client.
+    Client,
+    /// It passes on what others send.
+    Router,
+}
+
 /// Where a session listens and connects; everything else is set for a robot, not for a data centre.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct SessionConfig {
@@ -31,10 +46,8 @@ pub struct SessionConfig {
     pub listen: Vec<String>,
     /// Endpoints to connect to; tried for ever, [`RETRY`] apart, also after a connection was lost.
     pub connect: Vec<String>,
-    /// The endpoints to connect to are routers. Between two peers of one router zenoh passes nothing on, because it
-    /// expects them to reach each other; so of robot and operator one, the operator, has to be a client. A router that
-    /// does not answer within 3 s is then an error.
-    pub router: bool,
+    /// What this process is among others.
+    pub role: Role,
     /// Certificates for `tls/` and `quic/` endpoints; both sides of a link must show one.
     pub tls: Option<Tls>,
     /// Who may do what; `None`: anybody who can connect may do anything. Names are known from certificates only, so it
@@ -43,8 +56,11 @@ pub struct SessionConfig {
     /// A zenoh configuration (JSON5 or YAML) for link options.
     ///
     /// Its endpoints count where the list above is empty. What keeps old commands and strangers out is set over it:
-    /// peer mode, no discovery, lease, message size, retry.
+    /// the role, no connections to whoever is discovered, lease, message size, retry.
     pub zenoh_config_file: Option<PathBuf>,
+    /// Answer who asks the local network by multicast who is there, on this interface ([`super::scout()`]). It tells
+    /// anybody there where this process listens, and nothing else; `None`: say nothing.
+    pub lan: Option<String>,
     /// Silence after which a link counts as dead, [`DEFAULT_LEASE`]. Both ends should agree.
     pub lease: Duration,
     /// How long the handshake of a link may take, [`DEFAULT_OPEN_TIMEOUT`]. While nobody answers, a try over UDP or QUIC
@@ -57,10 +73,11 @@ impl Default for SessionConfig {
         Self {
             listen: Vec::new(),
             connect: Vec::new(),
-            router: false,
+            role: Role::Peer,
             tls: None,
             access: None,
             zenoh_config_file: None,
+            lan: None,
             lease: DEFAULT_LEASE,
             open_timeout: DEFAULT_OPEN_TIMEOUT,
         }
@@ -92,20 +109,30 @@ impl SessionConfig {
         if !self.connect.is_empty() {
             set(&mut config, "connect/endpoints", &endpoints(&self.connect)?)?;
         }
-        let (mode, patience) = if self.router { ("\"client\"", "3000") } else { ("\"peer\"", "-1") };
+        let (mode, patience, sessions) = match self.role {
+            Role::Peer => ("\"peer\"", "-1", "16"),
+            Role::Client => ("\"client\"", "3000", "16"),
+            Role::Router => ("\"router\"", "-1", "256"),
+        };
         set(&mut config, "mode", mode)?;
-        set(&mut config, "scouting/multicast/enabled", "false")?;
+        set(&mut config, "scouting/multicast/enabled", if self.lan.is_some() { "true" } else { "false" })?;
+        if let Some(interface) = &self.lan {
+            set_interface(&mut config, interface)?;
+            // Answers alone: nobody is connected to because it was heard.
+            set(&mut config, "scouting/multicast/autoconnect", "[]")?;
+            set(&mut config, "scouting/multicast/listen", "true")?;
+        }
         set(&mut config, "scouting/gossip/enabled", "false")?;
         set(&mut config, "listen/timeout_ms", "0")?;
         set(&mut config, "listen/exit_on_failure", "true")?;
         set(&mut config, "connect/timeout_ms", patience)?;
-        set(&mut config, "connect/exit_on_failure", if self.router { "true" } else { "false" })?;
+        set(&mut config, "connect/exit_on_failure", if self.role == Role::Client { "true" } else { "false" })?;
         let every = RETRY.as_millis();
         let retry = format!(r#"{{"period_init_ms": {every}, "period_max_ms": {every}, "period_increase_factor": 1}}"#);
         set(&mut config, "connect/retry", &retry)?;
         set(&mut config, "transport/link/tx/lease", &self.lease.as_millis().to_string())?;
         set(&mut config, "transport/link/rx/max_message_size", &MAX_MESSAGE_SIZE.to_string())?;
-        set(&mut config, "transport/unicast/max_sessions", "16")?;
+        set(&mut config, "transport/unicast/max_sessions", sessions)?;
         set(&mut config, "transport/unicast/open_timeout", &self.open_timeout.as_millis().to_string())?;
         set(&mut config, "transport/unicast/accept_timeout", "3000")?;
         if let Some(tls) = &self.tls {
@@ -164,7 +191,7 @@ fn endpoints(list: &[String]) -> Result<String, NetError> {
     Ok(serde_json::Value::from(out).to_string())
 }
 
-fn set(config: &mut Config, setting: &'static str, value: &str) -> Result<(), NetError> {
+pub(super) fn set(config: &mut Config, setting: &'static str, value: &str) -> Result<(), NetError> {
     config.insert_json5(setting, value).map_err(|error| NetError::Setting { setting, reason: words(&error) })
 }
 
@@ -181,6 +208,13 @@ mod tests {
         assert_eq!(get("connect/endpoints"), "[\"tcp/127.0.0.1:7447\"]");
         assert_eq!(get("transport/link/tx/lease"), "1000");
         assert_eq!(get("scouting/multicast/enabled"), "false");
+        let config = SessionConfig { lan: Some("lo".to_owned()), ..SessionConfig::default() }.zenoh().unwrap();
+        let get = |key: &str| config.get_json(key).unwrap();
+        assert_eq!(get("scouting/multicast/enabled"), "true");
+        assert_eq!(
+            (get("scouting/multicast/autoconnect"), get("scouting/gossip/enabled")),
+            ("[]".into(), "false".into())
+        );
     }
 
     #[test]

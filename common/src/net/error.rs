@@ -122,6 +122,22 @@ pub enum NetError {
         /// Longest allowed, bytes.
         allowed: usize,
     },
+    /// There is no such network interface.
+    #[error("no network interface is called {interface:?}: write auto, an address of this machine, or one of {known}")]
+    Interface {
+        /// What was given.
+        interface: String,
+        /// Those that there are.
+        known: String,
+    },
+    /// The local network cannot be asked.
+    #[error("cannot look for robots on the local network (interface {interface}): {reason}")]
+    Scout {
+        /// The interface.
+        interface: String,
+        /// What zenoh says.
+        reason: String,
+    },
     /// The session does not close.
     #[error("cannot close the session: {0}")]
     Close(String),
@@ -139,6 +155,7 @@ impl NetError {
                 | Self::Certificate { .. }
                 | Self::NoCertificate { .. }
                 | Self::AccessWithoutTls
+                | Self::Interface { .. }
                 | Self::AccessUnencrypted { .. }
         )
     }

@@ -10,6 +10,9 @@ use super::session::failed;
 /// Longest answer that [`super::Session::get`] takes, bytes.
 pub const MAX_ANSWER: usize = 65_536;
 
+/// Queries that wait to be answered.
+const QUERIES: usize = 8;
+
 /// Answers queries on one key, until it is dropped.
 #[derive(Debug)]
 pub struct Server {
@@ -19,16 +22,26 @@ pub struct Server {
 impl Server {
     pub(super) fn declare<F>(session: &zenoh::Session, key: &str, answer: F) -> Result<Self, NetError>
     where
-        F: Fn() -> Vec<u8> + Send + Sync + 'static,
+        F: Fn() -> Vec<u8> + Send + 'static,
     {
         let own_key = key.to_owned();
+        // An answer may wait for a peer that does not read, for as long as that peer's query says. So a thread of its own
+        // gives it, not the one that receives; who asks when the queue is full gets none, and asks again.
+        let (queries, inbox) = sync_channel::<Query>(QUERIES);
+        let body = move || {
+            for query in inbox {
+                if let Err(error) = query.reply(own_key.as_str(), answer()).wait() {
+                    tracing::debug!(key = own_key, %error, "query not answered");
+                }
+            }
+        };
+        let thread = std::thread::Builder::new().name("answers".to_owned()).spawn(body);
+        thread.map_err(|error| failed("serve", key, &error))?;
         let zenoh = session
             .declare_queryable(key.to_owned())
             .complete(true)
             .callback(move |query: Query| {
-                if let Err(error) = query.reply(own_key.as_str(), answer()).wait() {
-                    tracing::debug!(key = own_key, %error, "query not answered");
-                }
+                queries.try_send(query).ok();
             })
             .wait()
             .map_err(|error| failed("serve", key, &error))?;

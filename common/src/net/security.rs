@@ -28,17 +28,21 @@ pub struct Tls {
     pub key: PathBuf,
 }
 
-/// Who may do what with a robot, by the common names of their certificates. Whoever is not named may nothing.
+/// Who may do what with a robot, or through a router, by the common names of their certificates. Whoever is not named may
+/// nothing.
 ///
-/// An observer may watch and stop. A stop is reset by the operator that has the robot alone, but the robot knows it by a
-/// number that observers see: an observer that forges it could reset a stop. That moves nothing, since the hand follows
-/// only after the operator closed the clutch anew.
+/// An observer may watch and stop. A stop is reset by the operator that has the robot alone, on a key where observers may
+/// not write.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Access {
     /// May drive, stop and watch.
     pub operators: Vec<String>,
     /// May stop and watch.
     pub observers: Vec<String>,
+    /// Of a router: are robots.
+    pub robots: Vec<String>,
+    /// Of a router: are routers, and may pass on what anybody may.
+    pub routers: Vec<String>,
 }
 
 impl Tls {
@@ -81,35 +85,52 @@ impl Tls {
     }
 }
 
+const IN: &str = "ingress";
+const OUT: &str = "egress";
+
 impl Access {
     /// The settings of zenoh, at `access_control`.
     pub(super) fn settings(&self) -> String {
-        let keys = |keys: &[&str]| keys.iter().map(|key| format!("{ROOT}/*/{key}")).collect::<Vec<_>>();
-        let rule = |id: &str, flow: &str, messages: &[&str], names: &[&str]| {
+        // As a robot sees the others; a router sees them from both sides.
+        let rules = [
+            ("drive", IN, &["put"][..], &["cmd/pose"][..]),
+            ("reset", IN, &["put"], &["cmd/reset"]),
+            ("show", IN, &["liveliness_token"], &["live/operator/*"]),
+            ("stop", IN, &["put"], &["cmd/stop"]),
+            ("watch", IN, &["declare_subscriber"], &["state/*"]),
+            ("ask", IN, &["query"], &["srv/*"]),
+            ("look", IN, &["liveliness_query", "declare_liveliness_subscriber"], &["live/**"]),
+            ("tell", OUT, &["put", "reply"], &["state/*", "srv/*"]),
+            ("offer", OUT, &["declare_subscriber", "declare_queryable"], &["cmd/*", "srv/*"]),
+            ("live", OUT, &["liveliness_token"], &["live/robot/*"]),
+        ];
+        let id = |name: &str, flow: &str| format!("{name}-{flow}");
+        let rule = |(name, flow, messages, keys): (&str, &str, &[&str], &[&str])| {
+            let keys: Vec<_> = keys.iter().map(|key| format!("{ROOT}/*/{key}")).collect();
             json!({
-                "id": id, "permission": "allow", "flows": [flow], "messages": messages, "key_exprs": keys(names),
+                "id": id(name, flow), "permission": "allow", "flows": [flow], "messages": messages, "key_exprs": keys,
             })
         };
-        let rules = [
-            rule("drive", "ingress", &["put"], &["cmd/pose"]),
-            rule("show", "ingress", &["liveliness_token"], &["live/operator/*"]),
-            rule("stop", "ingress", &["put"], &["cmd/control"]),
-            rule("watch", "ingress", &["declare_subscriber"], &["state/*"]),
-            rule("ask", "ingress", &["query"], &["srv/*"]),
-            rule("look", "ingress", &["liveliness_query", "declare_liveliness_subscriber"], &["live/**"]),
-            rule("tell", "egress", &["put", "reply"], &["state/*", "srv/*"]),
-            rule("offer", "egress", &["declare_subscriber", "declare_queryable"], &["cmd/*", "srv/*"]),
-            rule("live", "egress", &["liveliness_token"], &["live/robot/*"]),
+        let mirrored = |flow| if flow == IN { OUT } else { IN };
+        let own: Vec<_> = rules.iter().map(|(name, flow, ..)| id(name, flow)).collect();
+        let other: Vec<_> = rules.iter().map(|(name, flow, ..)| id(name, mirrored(*flow))).collect();
+        let both = [own.as_slice(), &other].concat();
+        let people = [
+            ("operators", &self.operators, own.clone()),
+            ("observers", &self.observers, own[3..].to_vec()),
+            ("robots", &self.robots, other.clone()),
+            ("routers", &self.routers, both),
         ];
-        let ids: Vec<_> = rules.iter().map(|rule| rule["id"].clone()).collect();
         // zenoh takes an empty list of names for "anybody".
-        let people = [("operators", &self.operators, &ids[..]), ("observers", &self.observers, &ids[2..])];
         let named = || people.iter().filter(|(_, names, _)| !names.is_empty());
         let subjects: Vec<_> = named().map(|(id, names, _)| json!({ "id": id, "cert_common_names": names })).collect();
         let policies: Vec<_> = named().map(|(id, _, rules)| json!({ "rules": rules, "subjects": [id] })).collect();
+        let all = rules.into_iter().flat_map(|(name, flow, messages, keys)| {
+            [(name, flow, messages, keys), (name, mirrored(flow), messages, keys)]
+        });
         json!({
             "enabled": true, "default_permission": "deny",
-            "rules": rules, "subjects": subjects, "policies": policies,
+            "rules": all.map(rule).collect::<Vec<_>>(), "subjects": subjects, "policies": policies,
         })
         .to_string()
     }
@@ -187,15 +208,22 @@ mod tests {
 
     #[test]
     fn nobody_is_a_subject_without_a_name() {
-        let access = Access { operators: vec!["ada".to_owned()], observers: Vec::new() };
+        let access = Access { operators: vec!["ada".to_owned()], ..Access::default() };
         let settings: serde_json::Value = serde_json::from_str(&access.settings()).unwrap();
         assert_eq!(settings["default_permission"], "deny");
         assert_eq!(settings["subjects"], json!([{ "id": "operators", "cert_common_names": ["ada"] }]));
         assert_eq!(settings["policies"].as_array().unwrap().len(), 1);
-        let observers = Access { operators: Vec::new(), observers: vec!["eve".to_owned()] }.settings();
+        let observers = Access { observers: vec!["eve".to_owned()], ..Access::default() }.settings();
         let observers: serde_json::Value = serde_json::from_str(&observers).unwrap();
         let rules = observers["policies"][0]["rules"].as_array().unwrap();
-        assert!(rules.contains(&"stop".into()) && !rules.contains(&"drive".into()), "{rules:?}");
+        assert!(rules.contains(&"stop-ingress".into()), "{rules:?}");
+        let may_not = ["drive-ingress", "reset-ingress", "show-ingress"];
+        assert!(!rules.iter().any(|rule| may_not.contains(&rule.as_str().unwrap())), "{rules:?}");
+        // A robot at a router does what the others do at a robot the other way round.
+        let robots = Access { robots: vec!["left".to_owned()], ..Access::default() }.settings();
+        let robots: serde_json::Value = serde_json::from_str(&robots).unwrap();
+        let rules = robots["policies"][0]["rules"].as_array().unwrap();
+        assert!(rules.contains(&"tell-ingress".into()) && !rules.contains(&"drive-ingress".into()), "{rules:?}");
     }
 
     #[test]

@@ -3,8 +3,8 @@ use std::time::Duration;
 use zenoh::Wait;
 
 use super::error::words;
-use super::{Arrival, LiveToken, LiveWatch, NetError, Publisher, Server, SessionConfig, Stream, Subscriber};
-use super::{live, query};
+use super::{Arrival, LiveToken, LiveWatch, NetError, Publisher, Role, Server, SessionConfig, Stream, Subscriber};
+use super::{live, query, runtime};
 
 /// An open zenoh session. Cheap to clone; the last clone that is dropped closes it.
 #[derive(Clone, Debug)]
@@ -19,12 +19,13 @@ impl Session {
     /// # Errors
     /// [`NetError`] naming the endpoint, file or setting; an endpoint to listen on that is taken is an error.
     pub fn open(config: &SessionConfig) -> Result<Self, NetError> {
-        if config.listen.iter().chain(&config.connect).any(|endpoint| endpoint.starts_with("tls/")) {
-            tracing::warn!("a tls/ link of zenoh 1.10 can abort the process when its peer goes away: prefer quic/");
+        let endpoints = config.listen.iter().chain(&config.connect);
+        if runtime::needs_one_thread(endpoints) && !runtime::is_chosen() {
+            tracing::warn!("tls/ links are not safe in several threads, see `net::runtime`: set ZENOH_RUNTIME");
         }
         let zenoh = zenoh::open(config.zenoh()?).wait().map_err(|error| {
             let (listen, connect, reason) = (config.listen.clone(), config.connect.clone(), words(&error));
-            if config.router {
+            if config.role == Role::Client {
                 NetError::NoRouter { connect, reason }
             } else {
                 NetError::Open { listen, connect, reason }
@@ -67,13 +68,13 @@ impl Session {
 
     /// Answers each query on `key` with what `answer` returns, until the server is dropped.
     ///
-    /// `answer` runs on a receive thread: it should hand out something ready-made.
+    /// `answer` runs in a thread of its own; queries that come faster than it answers are dropped.
     ///
     /// # Errors
     /// [`NetError::Key`]
     pub fn serve<F>(&self, key: &str, answer: F) -> Result<Server, NetError>
     where
-        F: Fn() -> Vec<u8> + Send + Sync + 'static,
+        F: Fn() -> Vec<u8> + Send + 'static,
     {
         Server::declare(&self.zenoh, key, answer)
     }

@@ -6,7 +6,7 @@ use crate::time::{Exchange, MonoTime};
 /// First four bytes of every message.
 pub const MAGIC: [u8; 4] = *b"ALGT";
 /// Version of the protocol. Any change of any layout or meaning raises it.
-pub const PROTOCOL: u16 = 3;
+pub const PROTOCOL: u16 = 4;
 
 /// The kinds of message.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
