@@ -22,6 +22,8 @@ pub const SILENCE: Duration = Duration::from_millis(700);
 const STALE_ECHO: Duration = Duration::from_millis(500);
 /// Own send stamps that an echo may refer to: a second at the highest rate.
 const SENT_STAMPS: usize = 1024;
+/// A robot that has spoken another protocol for this long, and nothing else, will not speak ours.
+const FOREIGN: Duration = Duration::from_secs(3);
 /// How long a rejection explains why the robot holds.
 const REASON_LASTS: Duration = Duration::from_secs(2);
 
@@ -48,6 +50,8 @@ struct State {
     delivery: Delivery,
     bad: u64,
     first_bad: Option<WireError>,
+    // What another protocol said, from when to when.
+    foreign: Option<(WireError, MonoTime, MonoTime)>,
 }
 
 #[derive(Clone, Copy, Debug)]
@@ -83,6 +87,8 @@ pub struct Snapshot {
     pub bad: u64,
     /// What was wrong with the first of them.
     pub first_bad: Option<WireError>,
+    /// It is there, but of a release that cannot be understood.
+    pub foreign: Option<WireError>,
     /// Two robots of the same name answer.
     pub rivals: bool,
     /// What it does, and whether this operator has it; `None` if it is not connected.
@@ -279,6 +285,10 @@ impl Feedback {
             delivery: state.delivery,
             bad: state.bad,
             first_bad: state.first_bad,
+            foreign: state
+                .foreign
+                .filter(|(_, from, to)| !connected && to.since(*from) > FOREIGN && heard(*to))
+                .map(|(error, ..)| error),
             rivals: state.rivals.is_some_and(|at| now.since(at) < REASON_LASTS),
             authority: state
                 .joints
@@ -305,6 +315,10 @@ impl State {
             Err(error) => {
                 self.bad += 1;
                 self.first_bad.get_or_insert(error);
+                if matches!(error, WireError::Protocol { .. }) {
+                    let known = self.foreign.filter(|(.., to)| arrival.at.since(*to) < SILENCE);
+                    self.foreign = Some((error, known.map_or(arrival.at, |(_, from, _)| from), arrival.at));
+                }
                 None
             }
         }

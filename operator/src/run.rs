@@ -221,6 +221,7 @@ pub fn run(args: &RunArgs, shutdown: &Shutdown, terminal: &Terminal) -> Result<S
 
     let mut display = terminal.display(is_recording);
     let mut meter = RateMeter::default();
+    let mut foreign = None;
     while !pipeline.is_finished() {
         let status = Status {
             name: keys.name().to_owned(),
@@ -234,6 +235,10 @@ pub fn run(args: &RunArgs, shutdown: &Shutdown, terminal: &Terminal) -> Result<S
             let level = if status.robot.reason.is_some() { Level::Warn } else { Level::Info };
             let time = picture_time(now(), status.robot.picture_offset_ns);
             logger.log_text(time, level, &status_line(&status));
+        }
+        foreign = status.robot.foreign;
+        if foreign.is_some() {
+            break;
         }
         let wait = end.map_or(REFRESH, |end| end.saturating_duration_since(Instant::now()).min(REFRESH));
         if shutdown.wait(wait) || end.is_some_and(|end| Instant::now() >= end) {
@@ -255,6 +260,10 @@ pub fn run(args: &RunArgs, shutdown: &Shutdown, terminal: &Terminal) -> Result<S
         local.close().or_runtime()?;
     }
     result.or_runtime()?;
+    if let Some(error) = foreign {
+        let at = args.robot.connect.join(", ");
+        return Err(anyhow::anyhow!("robot {} at {at} cannot be understood: {error}", keys.name())).or_runtime();
+    }
     if progress.ended && !progress.confirmed {
         tracing::warn!("the robot did not confirm the last pose");
     }

@@ -396,6 +396,13 @@ mod tests {
         let robot = feedback.snapshot(MonoTime(0));
         let line = status_line(&Status { robot, ..status(None) });
         assert!(line.contains("not connected") && line.contains("ERROR: peer speaks wire protocol 99"), "{line}");
+        // It may be replaced by the right one, but not for ever.
+        assert_eq!(robot.foreign, None);
+        for ms in (0..4000).step_by(10) {
+            feedback.on_joints(Arrival { payload: Ok(&other), at: MonoTime(ms * 1_000_000) });
+        }
+        assert!(feedback.snapshot(MonoTime(4_000_000_000)).foreign.is_some());
+        assert_eq!(feedback.snapshot(MonoTime(5_000_000_000)).foreign, None, "it is silent");
         feedback.on_joints(Arrival { payload: Ok(b"hello"), at: MonoTime(0) });
         assert!(status_line(&Status { robot: feedback.snapshot(MonoTime(0)), ..status(None) }).contains("ERROR"));
     }

@@ -17,7 +17,9 @@ use teleop_common::net::{Session, SessionConfig, Stream};
 use teleop_common::recording::{FrameData, LastLine, RecordingReader};
 use teleop_common::testing::shared_data;
 use teleop_common::time::MonoTime;
-use teleop_common::wire::{Checked, Echo, JointStateMessage, PoseMessage, Stamper, pack_joints};
+use teleop_common::wire::{
+    Checked, Echo, JointStateMessage, MAGIC, Message as _, PROTOCOL, PoseMessage, Stamper, pack_joints,
+};
 use teleop_operator::cli::{Cli, RunArgs};
 use teleop_operator::feedback::Feedback;
 use teleop_operator::robot_link::RobotLink;
@@ -348,6 +350,31 @@ fn failures_before_anything_runs_are_told_apart() {
         assert!(message.contains(expected), "{line}: {message}");
         assert_eq!(is_usage, usage, "{line}: {message}");
     }
+}
+
+#[test]
+fn a_robot_of_another_release_ends_it_with_an_error() {
+    let session = Session::open(&SessionConfig::listening(["tcp/127.0.0.1:0"])).unwrap();
+    let endpoint = session.locators().remove(0);
+    let publisher = session.publisher(&Keys::new("newer").unwrap().joints(), Stream::State).unwrap();
+    let stop = Arc::new(AtomicBool::new(false));
+    let ended = Arc::clone(&stop);
+    let thread = std::thread::spawn(move || {
+        let mut bytes = [0; JointStateMessage::LEN];
+        bytes[..4].copy_from_slice(&MAGIC);
+        (bytes[4], bytes[6]) = (PROTOCOL as u8 + 1, JointStateMessage::KIND as u8);
+        while !ended.load(Ordering::Relaxed) {
+            publisher.put(&bytes).unwrap();
+            std::thread::sleep(STATE_EVERY);
+        }
+    });
+    let args = args(&format!("--name newer --connect {endpoint} --duration 30"));
+    let failure = run(&args, &Shutdown::default(), &Terminal::new()).unwrap_err();
+    let text = format!("{failure:#}");
+    assert!(text.contains("newer") && text.contains(&endpoint) && text.contains("same release on both ends"), "{text}");
+    assert!(matches!(failure, teleop_operator::failure::Failure::Runtime(_)));
+    stop.store(true, Ordering::Relaxed);
+    thread.join().unwrap();
 }
 
 #[test]

@@ -114,6 +114,12 @@ impl Attacker {
         put.express(true).wait().unwrap();
     }
 
+    /// Asks, in the most demanding way, and does not care for the answer.
+    fn ask(&self, key: &str) {
+        let get = self.0.get(key).timeout(Duration::from_secs(1)).congestion_control(CongestionControl::Block);
+        get.priority(Priority::RealTime).callback(drop).wait().unwrap();
+    }
+
     fn send<M: Message>(&self, key: &str, message: &M) {
         let mut bytes = [0; MAX_MESSAGE];
         let len = encode_into(message, &mut bytes).unwrap();
@@ -483,7 +489,8 @@ fn cost(robot: &Robot, probe: &Probe, body: impl FnOnce()) -> Cost {
     }
 }
 
-/// Sends as fast as it can for `duration`: poses that look right, controls that do not, garbage, what is far too long.
+/// Sends as fast as it can for `duration`: poses that look right, controls that do not, garbage, what is far too long,
+/// queries.
 /// Gives how many it sent.
 fn flood(attacker: &Attacker, probe: &Probe, duration: Duration) -> u64 {
     let [pose_key, control, unknown] = [probe.keys.pose(), probe.keys.stop(), probe.keys.hand_input()];
@@ -506,6 +513,7 @@ fn flood(attacker: &Attacker, probe: &Probe, duration: Duration) -> u64 {
             sent += 4;
         }
         attacker.put(&control, &long);
+        attacker.ask(&probe.keys.describe());
     }
     sent
 }
