@@ -6,10 +6,10 @@ use std::time::Duration;
 use anyhow::anyhow;
 use teleop_common::key::Keys;
 use teleop_common::net::clock::now;
-use teleop_common::net::{Session, SessionConfig, scout};
+use teleop_common::net::{NetError, Session, SessionConfig, scout};
 
 use crate::cli::{LinkArgs, RobotArgs};
-use crate::failure::{Failure, OrFail as _, not_open};
+use crate::failure::{Failure, not_open};
 use crate::shutdown::Shutdown;
 
 /// How long the network is listened to: whoever is there answers at once, and is asked three times.
@@ -53,17 +53,22 @@ fn robots_at(
     endpoints.sort_by_key(|endpoint| is_unlikely(endpoint));
     for endpoint in endpoints {
         let config = SessionConfig { open_timeout: LINK_TIMEOUT, ..link.session(std::slice::from_ref(&endpoint)) };
-        let session = Session::open(&config).map_err(not_open)?;
+        let session = match Session::open(&config) {
+            Ok(session) => session,
+            // Anybody may have named it.
+            Err(NetError::Endpoint { .. } | NetError::Open { .. }) => continue,
+            Err(error) => return Err(not_open(error)),
+        };
         let end = now() + LINK_TIMEOUT;
         while session.peers() == 0 && now() < end && !shutdown.wait(LOOK) {}
         if session.peers() > 0 {
-            let live = session.live_now(&Keys::all_live_robots(), LIVE_TIMEOUT).or_runtime()?;
+            let live = session.live_now(&Keys::all_live_robots(), LIVE_TIMEOUT).unwrap_or_default();
             // By name, since a process that tells of others may tell twice.
             let names: BTreeMap<_, _> = live
                 .iter()
                 .filter_map(|key| Some((Keys::of_live_robot(key)?.name().to_owned(), endpoint.clone())))
                 .collect();
-            session.close().or_runtime()?;
+            session.close().ok();
             return Ok(names.into_iter().collect());
         }
         session.close().ok();

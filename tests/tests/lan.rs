@@ -5,6 +5,7 @@
 use teleop_common::mode::Mode;
 use teleop_tests::probe::Probe;
 use teleop_tests::process::{Process, Robot, Signal, run};
+use zenoh::Wait as _;
 
 const LAN: &str = "--lan=127.0.0.1";
 
@@ -57,6 +58,23 @@ fn robots_that_may_be_found_are_listed_and_driven_by_name() {
     for robot in [shown, other, hidden, twin] {
         robot.process.assert_no_panic();
     }
+}
+
+#[test]
+fn what_strangers_answer_is_no_error() {
+    // A process of somebody else, which has no robot.
+    let settings = serde_json::json!({
+        "mode": "peer",
+        "listen": { "endpoints": ["tcp/127.0.0.1:0"] },
+        "scouting": { "multicast": { "enabled": true, "interface": "127.0.0.1", "autoconnect": [] } },
+    });
+    let stranger = zenoh::open(zenoh::Config::from_json5(&settings.to_string()).unwrap()).wait().unwrap();
+    let robot = Robot::listening(&["tcp/127.0.0.1:0"], &[LAN]);
+    let output = run("operator", &["list", LAN, "--json"]);
+    let text = String::from_utf8(output.stdout).unwrap();
+    assert_eq!((output.status.code(), text.lines().count()), (Some(0), 1), "{text}");
+    assert!(text.contains(robot.endpoint()), "{text}");
+    stranger.close().wait().unwrap();
 }
 
 #[test]
