@@ -176,8 +176,9 @@ impl World {
             assert_eq!(after, holder, "a pose that is refused changed who has the robot");
             return;
         }
-        let (age, _) = claim.age.expect("a pose of unknown age passed");
-        assert!(age <= MAX_AGE.as_secs_f64(), "a pose of {age} s passed");
+        let (age, uncertainty) = claim.age.expect("a pose of unknown age passed");
+        let most = MAX_AGE.as_secs_f64();
+        assert!(age <= most && uncertainty <= most, "a pose of {age} +- {uncertainty} s passed");
         if let Some(holder) = holder.filter(|holder| *holder != claim.epoch) {
             assert!(claim.takeover && self.takeover != Takeover::Never, "{holder} lost the robot to {}", claim.epoch);
             assert!(self.takeover == Takeover::Always || !follows, "{holder} lost the robot while it followed");

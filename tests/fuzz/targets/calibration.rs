@@ -8,7 +8,7 @@ use teleop_fuzz::{allegro, brief, within};
 
 fuzz_target!(|bytes: &[u8]| {
     let Ok(text) = std::str::from_utf8(bytes) else { return };
-    let mut calibration = match within(256 * text.len() + (1 << 16), || Calibration::from_text(text)) {
+    let mut calibration = match within(1024 * text.len() + (1 << 16), || Calibration::from_text(text)) {
         Ok(calibration) => calibration,
         Err(error) => return brief(&error),
     };

@@ -27,7 +27,7 @@ fuzz_target!(|bytes: &[u8]| {
     if let Err(error) = text.parse::<Gesture>() {
         brief(&error);
     }
-    match within(256 * text.len() + (1 << 16), || toml::from_str::<MappingParams>(text)) {
+    match within(1024 * text.len() + (1 << 16), || toml::from_str::<MappingParams>(text)) {
         Ok(params) => {
             if let Err(error) = params.validate() {
                 brief(&error);
