@@ -10,7 +10,7 @@ use teleop_common::hand::{JointVector, MAX_FINGERS};
 use teleop_fuzz::{allegro, without_allocating};
 
 /// Ticks of one input.
-const TICKS: u32 = 400;
+const TICKS: u32 = 200;
 const ALLOWANCE: f64 = 0.0005;
 
 #[derive(Arbitrary, Debug)]
