@@ -411,19 +411,8 @@ mod tests {
         toml::to_string(&table).unwrap()
     }
 
-    const PIECES: [&str; 24] = [
-        "\n",
-        "=",
-        ".",
-        "[",
-        "]",
-        "[[",
-        "{",
-        "}",
-        "\"",
-        "'",
-        "#",
-        ",",
+    const PIECES: [&str; 12] = ["\n", "=", ".", "[", "]", "{", "}", "\"", "#", ",", "[control]\n", "\u{0}"];
+    const VALUES: [&str; 16] = [
         "nan",
         "-inf",
         "1e400",
@@ -431,23 +420,52 @@ mod tests {
         "-1",
         "0",
         "1e-300",
+        "0.1",
+        "0.25",
+        "1",
+        "2.5",
         "9223372036854775808",
         "true",
         "\"paper\"",
-        "[control]\n",
-        "\u{0}",
+        "\"open\"",
+        "\"always\"",
     ];
+
+    #[derive(Clone, Debug)]
+    enum Change {
+        /// So many characters become a piece of syntax, or nothing.
+        Text(Index, usize, usize),
+        /// A line's value becomes another.
+        Value(Index, usize),
+    }
+
+    fn change() -> impl Strategy<Value = Change> {
+        prop_oneof![
+            1 => (any::<Index>(), 0..12_usize, 0..=PIECES.len()).prop_map(|(at, cut, piece)| Change::Text(at, cut, piece)),
+            4 => (any::<Index>(), 0..VALUES.len()).prop_map(|(at, value)| Change::Value(at, value)),
+        ]
+    }
 
     proptest! {
         /// Damaged configurations are refused in a few lines, or the loop runs with them.
         #[test]
-        fn damaged_text(changes in prop::collection::vec((any::<Index>(), 0..12_usize, 0..PIECES.len() + 1), 1..5)) {
+        fn damaged_text(changes in prop::collection::vec(change(), 1..5)) {
             let mut text = everything();
             prop_assert!(parse(&text).is_ok());
-            for (at, cut, piece) in changes {
-                let start = at.index(text.len() + 1);
-                let end = (start + cut).min(text.len());
-                text.replace_range(start..end, PIECES.get(piece).copied().unwrap_or(""));
+            for change in changes {
+                let (range, piece) = match change {
+                    Change::Text(at, cut, piece) => {
+                        let start = at.index(text.len() + 1);
+                        (start..(start + cut).min(text.len()), PIECES.get(piece).copied().unwrap_or(""))
+                    }
+                    Change::Value(at, value) => {
+                        let values: Vec<_> = text.match_indices(" = ").map(|(start, _)| start + 3).collect();
+                        let start = *at.get(&values);
+                        let end = text[start..].find('\n').map_or(text.len(), |length| start + length);
+                        (start..end, VALUES[value])
+                    }
+                };
+                text.replace_range(range, piece);
             }
             let config = match parse(&text) {
                 Ok(config) => config,
