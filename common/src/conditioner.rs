@@ -75,7 +75,7 @@ impl Conditioner {
         self.stages = [self.position; 2];
     }
 
-    /// Next command towards `target` (rad), with speeds further limited to `speed` (rad/s).
+    /// Next command towards `target` (rad), with speeds further limited to `speed` (rad/s; 0 if it is negative or none).
     ///
     /// `adjust` may change the velocities that bring the hand there (rad/s); it gets the last command (rad), the
     /// velocities, and the least and largest that the limits allow. A target that is not finite is ignored: the joint
@@ -128,8 +128,8 @@ impl Conditioner {
         let limits = self.limits[joint];
         let (position, velocity) = (self.position[joint], self.velocity[joint]);
         let change = limits.acceleration * self.period;
-        // A lower speed limit is reached by braking, never by a jump.
-        let speed = speed.max(velocity.abs() - change).min(limits.velocity);
+        // A lower speed limit is reached by braking, never by a jump. One that is no number is 0.
+        let speed = speed.max(0.0).max(velocity.abs() - change).min(limits.velocity);
         let (low, high) = ((velocity - change).max(-speed), (velocity + change).min(speed));
         // Last, because it is never in conflict with the acceleration: every earlier step kept the way to brake.
         let to_lower = -brakeable(position - limits.lower, limits.acceleration, self.period);
@@ -187,10 +187,14 @@ mod tests {
         ]
     }
 
+    fn limit() -> impl Strategy<Value = f64> {
+        prop_oneof![8 => 0.0..9.0_f64, 1 => Just(f64::NAN), 1 => Just(f64::INFINITY), 1 => Just(-3.0)]
+    }
+
     proptest! {
         #[test]
         fn limits_are_never_exceeded(
-            targets in prop::collection::vec((prop::collection::vec(adversarial(), 16), 1usize..40, 0.0..9.0_f64, any::<bool>()), 1..30),
+            targets in prop::collection::vec((prop::collection::vec(adversarial(), 16), 1usize..40, limit(), any::<bool>()), 1..30),
             smoothing in prop_oneof![Just(0.0), 0.001..0.05_f64],
             start in prop::collection::vec(-3.0..3.0_f64, 16),
         ) {
@@ -247,6 +251,22 @@ mod tests {
             let speed = 2.0;
             let lag = speed * speed / (2.0 * acceleration) + 2.0 * speed * PERIOD;
             assert!((conditioner.position()[1] - target[1]).abs() < lag, "at {phase}");
+        }
+    }
+
+    /// Found by fuzzing: the joint moved, away from its target.
+    #[test]
+    fn a_speed_limit_that_is_none_moves_nothing() {
+        let hand = hand();
+        let mut conditioner = Conditioner::new(&hand, &hand.home(), PERIOD, 0.0);
+        let mut target = hand.home();
+        target[2] = 1.6;
+        for speed in [f64::NAN, -1.0, f64::NEG_INFINITY, 0.0] {
+            conditioner.follow(&target, speed, |_, velocity, [low, high]| {
+                assert!(low.iter().zip(high.iter()).all(|(low, high)| low <= high), "{low:?} {high:?}");
+                assert!(velocity.iter().all(|velocity| *velocity == 0.0), "{velocity:?}");
+            });
+            assert!(conditioner.at_rest() && *conditioner.position() == hand.home());
         }
     }
 

@@ -15,7 +15,7 @@ use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
-use crate::master::MasterPose;
+use crate::master::{MAX_ANGLE, MasterPose};
 use crate::time::MonoTime;
 
 /// Poses kept: more than the longest delay holds at 200 Hz.
@@ -29,6 +29,9 @@ const MAX_NEED: Duration = Duration::from_millis(500);
 /// How fast the delay grows and falls, s/s.
 const GROWS: f64 = 0.1;
 const FALLS: f64 = 0.05;
+/// No prediction is faster, rad/s, because no finger is. Two stamps that lie closely together, as when the clock offset
+/// is corrected between two poses, would make it any speed.
+pub const MAX_SPEED: f64 = 30.0;
 /// Once buffering, the needs must be this share of the tolerance to go back.
 const CALM: f64 = 0.5;
 
@@ -98,6 +101,8 @@ pub struct Playout {
     buffers: bool,
     delay: f64,
     last: Option<MonoTime>,
+    // What was played last was captured then; it never gets less.
+    reached: MonoTime,
 }
 
 impl Playout {
@@ -113,6 +118,7 @@ impl Playout {
             buffers: false,
             delay: 0.0,
             last: None,
+            reached: MonoTime(0),
         }
     }
 
@@ -120,6 +126,7 @@ impl Playout {
     pub fn reset(&mut self) {
         self.poses.clear();
         (self.next, self.count, self.buffers, self.delay, self.last) = (0, 0, false, 0.0, None);
+        self.reached = MonoTime(0);
     }
 
     /// The delay behind the capture that is being played; zero: the newest pose is.
@@ -157,14 +164,21 @@ impl Playout {
         self.last = Some(now);
         let wanted = self.wanted(now);
         self.delay += (wanted - self.delay).clamp(-FALLS * passed, GROWS * passed);
-        let time = MonoTime(now.0.saturating_sub((self.delay * 1e9) as u64));
+        let time = MonoTime(now.0.saturating_sub((self.delay * 1e9) as u64)).max(self.reached);
+        let played = self.at(newest, time);
+        self.reached = played.captured;
+        Some(played)
+    }
+
+    /// What to play of `time`.
+    fn at(&self, newest: Entry, time: MonoTime) -> Played {
         let after = self.poses.partition_point(|entry| entry.captured <= time);
         if after == self.poses.len() {
-            return Some(self.predict(newest, time));
+            return self.predict(newest, time);
         }
         let later = self.poses[after];
         let Some(earlier) = after.checked_sub(1).map(|index| self.poses[index]) else {
-            return Some(Played { pose: later.pose, captured: later.captured });
+            return Played { pose: later.pose, captured: later.captured };
         };
         let whole = later.captured.since(earlier.captured).as_secs_f64();
         let share = time.since(earlier.captured).as_secs_f64() / whole;
@@ -173,7 +187,7 @@ impl Playout {
         for (joint, angle) in pose.q.iter_mut().enumerate() {
             *angle = earlier.pose.q[joint] + (later.pose.q[joint] - earlier.pose.q[joint]) * share;
         }
-        Some(Played { pose, captured: time })
+        Played { pose, captured: time }
     }
 
     /// Beyond the newest pose: that, or a little farther the way it went.
@@ -181,11 +195,16 @@ impl Playout {
         let tau = self.params.predict.as_secs_f64();
         let before = self.poses.len().checked_sub(2).map(|index| self.poses[index]);
         let (mut pose, mut captured) = (newest.pose, newest.captured);
-        if let (Some(before), true) = (before, self.delay > 0.0 && tau > 0.0) {
+        // Where the delay has just ended, the prediction stays where it is until poses have caught up with it.
+        let mut ahead = self.reached.since(newest.captured).as_secs_f64();
+        if self.delay > 0.0 && tau > 0.0 {
+            ahead = ahead.max(tau * (1.0 - (-time.since(newest.captured).as_secs_f64() / tau).exp()));
+        }
+        if let Some(before) = before.filter(|_| ahead > 0.0) {
             let period = newest.captured.since(before.captured).as_secs_f64();
-            let ahead = tau * (1.0 - (-time.since(newest.captured).as_secs_f64() / tau).exp());
             for (joint, angle) in pose.q.iter_mut().enumerate() {
-                *angle += (*angle - before.pose.q[joint]) / period * ahead;
+                let speed = ((*angle - before.pose.q[joint]) / period).clamp(-MAX_SPEED, MAX_SPEED);
+                *angle = (*angle + speed * ahead).clamp(-MAX_ANGLE, MAX_ANGLE);
             }
             captured = captured + Duration::from_secs_f64(ahead);
         }

@@ -168,6 +168,8 @@ fn file_round_trip_and_refusals() {
     assert!(matches!(Calibration::from_text(&huge.to_text()), Err(CalibrationTextError::Implausible(_))));
     assert!(matches!(Calibration::from_text("hello"), Err(CalibrationTextError::Toml(_))));
     assert!(matches!(Calibration::from_text(""), Err(CalibrationTextError::Format { .. })));
+    let long = Calibration::from_text(&"#".repeat(70_000)).unwrap_err().to_string();
+    assert!(long.contains("70000 bytes are more than the 65536 allowed"), "{long}");
     let cut = Calibration::from_text(&text[..text.len() / 2]);
     assert!(cut.is_err(), "{cut:?}");
 }

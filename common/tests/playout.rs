@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use master_support::Noise;
 use teleop_common::master::{Calibrator, Filter, FilterSettings, Fitter, MasterGeometry, MasterPose};
-use teleop_common::playout::{Playout, PlayoutMode, PlayoutParams};
+use teleop_common::playout::{MAX_SPEED, Played, Playout, PlayoutMode, PlayoutParams};
 use teleop_common::time::MonoTime;
 
 const MS: u64 = 1_000_000;
@@ -128,6 +128,59 @@ fn a_reset_forgets_the_other_operator() {
     assert_eq!(playout.play(MonoTime(4000)), None);
     playout.push(MonoTime(10), MonoTime(4500), &pose(2.0));
     assert_eq!(playout.play(MonoTime(5000)).unwrap().pose, pose(2.0), "an earlier capture of another clock");
+}
+
+/// A link on which the buffer has a delay, and then nothing more comes, from 9 s on.
+fn buffering() -> Playout {
+    let mut playout = Playout::new(PlayoutParams::default());
+    let mut dice = Noise(3);
+    let mut newest = 0;
+    for n in 0..800 {
+        let captured = 1000 * MS + n * 10 * MS;
+        let received = (captured + ((20.0 + 40.0 * dice.uniform()) * 1e6) as u64).max(newest);
+        newest = received;
+        playout.push(MonoTime(captured), MonoTime(received), &pose(motion(captured as f64 * 1e-9)));
+        playout.play(MonoTime(received));
+    }
+    assert!(playout.delay() > Duration::from_millis(50), "{:?}", playout.delay());
+    playout
+}
+
+/// Found by fuzzing: the prediction over a gap ended where the delay did, and the motion jumped back.
+#[test]
+fn a_delay_that_ends_in_a_gap_moves_nothing() {
+    let mut playout = buffering();
+    let mut before: Option<Played> = None;
+    let mut after_the_delay = 0;
+    for now in (9100 * MS..30_000 * MS).step_by(TICK as usize) {
+        let played = playout.play(MonoTime(now)).unwrap();
+        if let Some(before) = before {
+            assert!(played.captured >= before.captured, "time runs backwards");
+            let step = played.pose.q[0] - before.pose.q[0];
+            assert!(step.abs() < 0.01, "a step of {step} rad");
+        }
+        after_the_delay += u32::from(playout.delay().is_zero());
+        before = Some(played);
+    }
+    assert!(after_the_delay > 100, "it ended");
+}
+
+/// Found by fuzzing: two captures that lie closely together, as when the clock offset is corrected between two poses,
+/// were taken for a speed of thousands of rad/s.
+#[test]
+fn a_prediction_is_no_faster_than_a_finger() {
+    for apart in [1, 1000, 100_000] {
+        let mut playout = buffering();
+        let last = 1000 * MS + 799 * 10 * MS;
+        let value = motion(last as f64 * 1e-9) + 0.3;
+        playout.push(MonoTime(last + apart), MonoTime(9100 * MS), &pose(value));
+        for now in (9100 * MS..9400 * MS).step_by(TICK as usize) {
+            let played = playout.play(MonoTime(now)).unwrap().pose;
+            played.validate().unwrap();
+            let reach = MAX_SPEED * PlayoutParams::default().predict.as_secs_f64();
+            assert!((played.q[0] - value).abs() <= reach + 0.3, "{} rad from {value}", played.q[0]);
+        }
+    }
 }
 
 /// What a gap in a real hand's motion is best filled with. Prints the table from which the default was chosen.

@@ -4,8 +4,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use clap::ValueEnum;
-use serde::Deserialize;
-use teleop_common::authority::{Clutch, Intent, OperatorName};
+use teleop_common::authority::{Clutch, ClutchInput, Intent, OperatorName};
 use teleop_common::mode::Mode;
 use teleop_common::time::MonoTime;
 
@@ -30,16 +29,6 @@ const KEY_HELD: Duration = Duration::from_millis(600);
 const IN_VAIN: Duration = Duration::from_millis(1500);
 /// How long the robot must have been ready after a hold before [`ClutchBy::Auto`] closes again.
 const AGAIN: Duration = Duration::from_secs(1);
-
-/// What another program says about the clutch.
-#[derive(Clone, Copy, Debug, PartialEq, Deserialize)]
-#[serde(deny_unknown_fields)]
-struct ClutchInput {
-    closed: bool,
-    /// Seconds after which it opens unless this is said again: a deadman pedal.
-    #[serde(rename = "for")]
-    lasts: Option<f64>,
-}
 
 /// The clutch and its rules; shared by all who move it. No clocks and no threads in here.
 #[derive(Clone, Debug)]
@@ -91,23 +80,17 @@ impl Pilot {
         }
     }
 
-    /// Another program moves the clutch: `{"closed": true}`, or `{"closed": true, "for": 0.3}` for a pedal that says so
-    /// again and again while it is pressed.
+    /// Another program moves the clutch, in JSON, see [`ClutchInput`].
     ///
     /// # Errors
     /// What is wrong with the message; nothing changes then.
     pub fn on_input(&self, bytes: &[u8], now: MonoTime) -> Result<(), String> {
-        let input: ClutchInput = serde_json::from_slice(bytes).map_err(|error| error.to_string())?;
-        let lasts = match input.lasts {
-            None => None,
-            Some(seconds) if (0.01..=60.0).contains(&seconds) => Some(Duration::from_secs_f64(seconds)),
-            Some(seconds) => return Err(format!("for is {seconds}, it must be 0.01 to 60 s")),
-        };
+        let input = ClutchInput::parse(bytes)?;
         let mut state = self.lock();
         if input.closed {
-            state.close(now, lasts.map(|lasts| now + lasts))
+            state.close(now, input.lasts.map(|lasts| now + lasts));
         } else {
-            state.open(now)
+            state.open(now);
         }
         Ok(())
     }

@@ -344,9 +344,18 @@ impl HandSource {
 
 #[cfg(test)]
 mod tests {
+    use proptest::prelude::*;
+    use proptest::sample::Index;
+    use teleop_common::authority::{Clutch, Latch};
+    use teleop_common::hand::JointVector;
     use teleop_common::mapping::BaselineParams;
+    use teleop_common::master::{Gesture, MasterGeometry, MasterPose};
+    use teleop_common::mode::Mode;
+    use teleop_common::time::MonoTime;
 
     use super::*;
+    use crate::control::{Controller, PoseSample};
+    use crate::driver::JointState;
 
     fn parse(text: &str) -> Result<Config, ConfigError> {
         Config::parse(text, Path::new("robot.toml"), &Overrides::default())
@@ -392,6 +401,100 @@ mod tests {
         ] {
             let message = parse(text).unwrap_err().to_string();
             assert!(message.contains(expected), "{text}: {message}");
+        }
+    }
+
+    /// All there is, with its defaults.
+    fn everything() -> String {
+        let mut table = toml::Table::try_from(File::default()).unwrap();
+        table.insert("mapping".to_owned(), toml::Value::try_from(MappingParams::default()).unwrap());
+        toml::to_string(&table).unwrap()
+    }
+
+    const PIECES: [&str; 12] = ["\n", "=", ".", "[", "]", "{", "}", "\"", "#", ",", "[control]\n", "\u{0}"];
+    const VALUES: [&str; 16] = [
+        "nan",
+        "-inf",
+        "1e400",
+        "-0.0",
+        "-1",
+        "0",
+        "1e-300",
+        "0.1",
+        "0.25",
+        "1",
+        "2.5",
+        "9223372036854775808",
+        "true",
+        "\"paper\"",
+        "\"open\"",
+        "\"always\"",
+    ];
+
+    #[derive(Clone, Debug)]
+    enum Change {
+        /// So many characters become a piece of syntax, or nothing.
+        Text(Index, usize, usize),
+        /// A line's value becomes another.
+        Value(Index, usize),
+    }
+
+    fn change() -> impl Strategy<Value = Change> {
+        prop_oneof![
+            1 => (any::<Index>(), 0..12_usize, 0..=PIECES.len()).prop_map(|(at, cut, piece)| Change::Text(at, cut, piece)),
+            4 => (any::<Index>(), 0..VALUES.len()).prop_map(|(at, value)| Change::Value(at, value)),
+        ]
+    }
+
+    proptest! {
+        /// Damaged configurations are refused in a few lines, or the loop runs with them.
+        #[test]
+        fn damaged_text(changes in prop::collection::vec(change(), 1..5)) {
+            let mut text = everything();
+            prop_assert!(parse(&text).is_ok());
+            for change in changes {
+                let (range, piece) = match change {
+                    Change::Text(at, cut, piece) => {
+                        let start = at.index(text.len() + 1);
+                        (start..(start + cut).min(text.len()), PIECES.get(piece).copied().unwrap_or(""))
+                    }
+                    Change::Value(at, value) => {
+                        let values: Vec<_> = text.match_indices(" = ").map(|(start, _)| start + 3).collect();
+                        let start = *at.get(&values);
+                        let end = text[start..].find('\n').map_or(text.len(), |length| start + length);
+                        (start..end, VALUES[value])
+                    }
+                };
+                text.replace_range(range, piece);
+            }
+            let config = match parse(&text) {
+                Ok(config) => config,
+                Err(error) => {
+                    let message = error.to_string();
+                    prop_assert!(!message.is_empty() && message.len() < 4096, "{message}");
+                    return Ok(());
+                }
+            };
+            let source = HandSource { side: HandSide::Right, urdf: None, description: None };
+            let hand = source.load(&config).unwrap();
+            // It may name a joint map that this hand does not have.
+            let Ok(mut controller) = Controller::new(hand.clone(), config.mapping, config.control) else { return Ok(()) };
+            let still = JointVector::zeros(hand.joints.len());
+            let state = JointState { q: hand.home(), dq: still, tau: still };
+            let (mut now, mut clutch) = (MonoTime(0), Clutch::default());
+            for sequence in 1..60 {
+                now = now + Duration::from_secs_f64(1.0 / config.control.rate);
+                clutch = clutch.eager(controller.mode());
+                let q = Gesture::Fist.sample(2.0);
+                let pose = MasterPose { q, geometry: MasterGeometry::PARADIGMATIC, tuning: None };
+                controller.admit(&PoseSample::instant(now, sequence, pose, clutch));
+                let record = controller.tick(now, Latch::default(), &state);
+                prop_assert_ne!(record.mode, Mode::Faulted);
+                for (q, joint) in record.command.q.iter().zip(&hand.joints) {
+                    prop_assert!((joint.lower..=joint.upper).contains(q), "{} at {}", joint.name, q);
+                }
+            }
+            prop_assert!(controller.mode().follows());
         }
     }
 }

@@ -6,6 +6,7 @@
 //! | [`process`] | the real binaries as child processes |
 //! | [`probe`] | what a robot publishes, with arrival times |
 //! | [`judge`] | whether a robot's commands kept their limits |
+//! | [`network`] | the network between two cores in virtual time |
 //!
 //! The bad network between two processes is the package `teleop-link`.
 
@@ -13,6 +14,7 @@ use std::time::{Duration, Instant};
 
 pub mod certificates;
 pub mod judge;
+pub mod network;
 pub mod probe;
 pub mod process;
 

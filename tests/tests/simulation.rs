@@ -6,8 +6,6 @@
 
 #![allow(clippy::unwrap_used, reason = "helpers of tests")]
 
-use std::cmp::Reverse;
-use std::collections::BinaryHeap;
 use std::fmt::Write as _;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -18,8 +16,8 @@ use teleop_common::mapping::{MappingParams, Retargeter};
 use teleop_common::master::{Gesture, MasterGeometry, MasterPose};
 use teleop_common::net::Arrival;
 use teleop_common::time::{Histogram, MonoTime};
-use teleop_common::wire::{JointStateMessage, MAX_MESSAGE, Message, PoseMessage, Stamper, encode_into, pack_joints};
-use teleop_link::{Blackouts, Fate, Impairment, Link, LinkModel, Profile};
+use teleop_common::wire::{JointStateMessage, PoseMessage, Stamper, pack_joints};
+use teleop_link::{Blackouts, Impairment, Link, Profile};
 use teleop_operator::feedback::Feedback;
 use teleop_operator::pilot::{ClutchBy, Pilot};
 use teleop_robot::control::{ControlParams, Controller, TickRecord};
@@ -27,6 +25,7 @@ use teleop_robot::driver::JointState;
 use teleop_robot::receive::Receiver;
 use teleop_robot::runtime::Shared;
 use teleop_tests::judge::{Command, assert_limits};
+use teleop_tests::network::Network;
 
 const MS: u64 = 1_000_000;
 /// Virtual seconds of each scenario.
@@ -82,35 +81,6 @@ struct Outcome {
     late: u64,
 }
 
-#[derive(PartialEq, Eq, PartialOrd, Ord)]
-struct Packet {
-    at: Duration,
-    number: u64,
-    up: bool,
-    bytes: Vec<u8>,
-}
-
-struct World {
-    models: [LinkModel; 2],
-    packets: BinaryHeap<Reverse<Packet>>,
-    number: u64,
-}
-
-impl World {
-    fn send<M: Message>(&mut self, now: Duration, up: bool, message: &M) {
-        let mut buffer = [0; MAX_MESSAGE];
-        let length = encode_into(message, &mut buffer).unwrap();
-        // What zenoh and UDP add.
-        if let Fate::Arrives { at, copy } = self.models[usize::from(!up)].send(now, length + 60) {
-            for at in [Some(at), copy].into_iter().flatten() {
-                self.number += 1;
-                let bytes = buffer[..length].to_vec();
-                self.packets.push(Reverse(Packet { at, number: self.number, up, bytes }));
-            }
-        }
-    }
-}
-
 fn nanos(time: Duration) -> u64 {
     u64::try_from(time.as_nanos()).unwrap()
 }
@@ -132,7 +102,7 @@ fn run(scenario: &Scenario, seed: u64) -> Outcome {
     let feedback = Feedback::new(OPERATOR);
     let pilot = Pilot::new(ClutchBy::Auto, OperatorName::default(), false);
     let (mut pose_stamps, mut state_stamps) = (Stamper::new(OPERATOR), Stamper::new(ROBOT));
-    let mut world = World { models: scenario.link.models(seed), packets: BinaryHeap::new(), number: 0 };
+    let mut network = Network::new(&scenario.link, seed);
 
     let robot_clock = |time: Duration| MonoTime(ROBOT_ZERO + nanos(time));
     let operator_clock =
@@ -155,13 +125,13 @@ fn run(scenario: &Scenario, seed: u64) -> Outcome {
         let now = tick * number;
         // What happens until this tick, in its order.
         loop {
-            let arrival = world.packets.peek().map(|Reverse(packet)| packet.at);
+            let arrival = network.next();
             let next = next_pose.min(next_state).min(arrival.unwrap_or(Duration::MAX));
             if next > now {
                 break;
             }
             if arrival == Some(next) {
-                let Reverse(packet) = world.packets.pop().unwrap();
+                let packet = network.take().unwrap();
                 let payload = Ok(packet.bytes.as_slice());
                 if packet.up {
                     receiver.on_pose(Arrival { payload, at: robot_clock(next) });
@@ -176,7 +146,7 @@ fn run(scenario: &Scenario, seed: u64) -> Outcome {
                 feedback.on_sent(at);
                 let header = pose_stamps.header::<PoseMessage>(at);
                 let message = PoseMessage::new(header, feedback.echo(at), at, &pose(next), pilot.intent());
-                world.send(next, true, &message);
+                network.send(next, true, &message);
             } else {
                 next_state += PERIOD;
                 let at = robot_clock(next);
@@ -198,7 +168,7 @@ fn run(scenario: &Scenario, seed: u64) -> Outcome {
                     stop: 0,
                     holder: receiver.holder(at).map_or(0, |(epoch, _)| epoch),
                 };
-                world.send(next, false, &message);
+                network.send(next, false, &message);
             }
         }
         while let Ok(sample) = admitted.pop() {

@@ -1,3 +1,7 @@
+use std::time::Duration;
+
+use serde::Deserialize;
+
 use crate::mode::Mode;
 
 /// The operator's clutch (deadman switch): how often it was moved. Odd: closed, the robot may follow. Even: open.
@@ -40,6 +44,39 @@ impl Clutch {
     }
 }
 
+/// What another program says about the clutch: a pedal, a button.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct ClutchInput {
+    /// Whether the robot may follow.
+    pub closed: bool,
+    /// After this time it opens unless this is said again: a deadman pedal.
+    pub lasts: Option<Duration>,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct RawClutch {
+    closed: bool,
+    #[serde(rename = "for")]
+    lasts: Option<f64>,
+}
+
+impl ClutchInput {
+    /// Of JSON: `{"closed": true}`, or `{"closed": true, "for": 0.3}` for 0.3 s.
+    ///
+    /// # Errors
+    /// Names the field that is missing or unknown, or the time that is none from 0.01 to 60 s.
+    pub fn parse(bytes: &[u8]) -> Result<Self, String> {
+        let raw: RawClutch = serde_json::from_slice(bytes).map_err(|error| error.to_string())?;
+        let lasts = match raw.lasts {
+            None => None,
+            Some(seconds) if (0.01..=60.0).contains(&seconds) => Some(Duration::from_secs_f64(seconds)),
+            Some(seconds) => return Err(format!("for is {seconds}, it must be 0.01 to 60 s")),
+        };
+        Ok(Self { closed: raw.closed, lasts })
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -62,5 +99,24 @@ mod tests {
         assert!(Clutch(3).closed_since(Clutch(1)));
         assert!(!Clutch(1).closed_since(Clutch(3)), "an old one");
         assert!(Clutch(1).closed_since(Clutch(u32::MAX)), "after a wrap");
+    }
+
+    #[test]
+    fn other_programs_say_it_in_json() {
+        let parse = |text: &str| ClutchInput::parse(text.as_bytes());
+        assert_eq!(parse("{\"closed\": true}"), Ok(ClutchInput { closed: true, lasts: None }));
+        let pedal = ClutchInput { closed: true, lasts: Some(Duration::from_millis(300)) };
+        assert_eq!(parse("{\"closed\": true, \"for\": 0.3}"), Ok(pedal));
+        for (bad, why) in [
+            ("{}", "missing field `closed`"),
+            ("{\"closed\": 1}", "expected a boolean"),
+            ("{\"closed\": true, \"open\": false}", "unknown field `open`"),
+            ("{\"closed\": true, \"for\": -1}", "for is -1, it must be 0.01 to 60 s"),
+            ("{\"closed\": true, \"for\": 1e300}", "it must be 0.01 to 60 s"),
+            ("\u{1}", "expected value"),
+        ] {
+            let error = parse(bad).unwrap_err();
+            assert!(error.contains(why), "{bad}: {error}");
+        }
     }
 }

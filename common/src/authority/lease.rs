@@ -50,7 +50,8 @@ pub struct Claim {
 /// leaves, has been silent for [`LeaseParams::release_after`], or another takes over as far as
 /// [`LeaseParams::takeover`] permits. Within an epoch poses only go forwards. A pose is judged by its age since
 /// capture, because every transport may deliver a backlog of old poses after a stall; one whose age is unknown, or
-/// might be above the limit for all that is known, is not obeyed. Only messages that are obeyed prolong the lease.
+/// uncertain by more than the limit itself, is not obeyed. So even where one way takes all of the round trip no pose is
+/// twice as old as the limit. Only messages that are obeyed prolong the lease.
 #[derive(Clone, Debug)]
 pub struct Lease {
     params: LeaseParams,
@@ -108,6 +109,11 @@ impl Lease {
         let young = age <= self.params.max_age.as_secs_f64();
         if !young {
             return Err(Rejection::Stale);
+        }
+        // On a stream that is held up round trips may take seconds, and only one of the ways.
+        let known = uncertainty <= self.params.max_age.as_secs_f64();
+        if !known {
+            return Err(Rejection::Clock);
         }
         // Captured in the future, beyond what the uncertainty of the clocks explains.
         if age < -(uncertainty + 0.005) {
@@ -210,5 +216,9 @@ mod tests {
         assert_eq!(admit(6, (f64::NAN, 0.0)), Err(Rejection::Stale));
         assert_eq!(admit(6, (-0.02, 0.001)), Err(Rejection::Other));
         assert_eq!(admit(6, (-0.02, 0.02)), Ok(()));
+        // Round trips of 9 s: it may be seconds old as well.
+        assert_eq!(admit(7, (0.1, 4.5)), Err(Rejection::Clock));
+        assert_eq!(admit(7, (0.1, f64::NAN)), Err(Rejection::Clock));
+        assert_eq!(admit(7, (0.2, 0.25)), Ok(()));
     }
 }

@@ -50,7 +50,7 @@ mod lease;
 mod machine;
 mod stop;
 
-pub use clutch::Clutch;
+pub use clutch::{Clutch, ClutchInput};
 pub use intent::{Intent, OperatorName, OperatorNameError};
 pub use lease::{Claim, Lease, LeaseParams, Takeover};
 pub use machine::{Heard, Machine, MachineParams};

@@ -34,6 +34,8 @@ const MIN_TOUCH_FRAMES: u64 = 5;
 
 const FORMAT: &str = "allegro-teleop-calibration";
 const VERSION: u32 = 1;
+/// Longest calibration file, bytes.
+const MAX_TEXT: usize = 64 * 1024;
 
 /// Median absolute deviations, m: how far the tracker's bones vary.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -425,6 +427,11 @@ impl Calibration {
     /// # Errors
     /// Names the unknown format, version or field, or the number no hand has.
     pub fn from_text(text: &str) -> Result<Self, CalibrationTextError> {
+        let size = text.len();
+        if size > MAX_TEXT {
+            let problem = format!("{size} bytes are more than the {MAX_TEXT} allowed; is this the right file?");
+            return Err(CalibrationTextError::Toml(problem));
+        }
         let toml = |error: toml::de::Error| CalibrationTextError::Toml(error.to_string());
         let mut table: toml::Table = toml::from_str(text).map_err(toml)?;
         let found = table.remove("format").map_or_else(String::new, |v| v.as_str().unwrap_or_default().to_owned());

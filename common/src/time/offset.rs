@@ -40,7 +40,7 @@ pub enum ClockError {
         /// t3 - t2, ns, cut to 64 bits.
         peer_ns: i64,
     },
-    /// The peer claims to have held the message for longer than the round trip took.
+    /// The peer claims to have held the message for longer than the round trip took, by more than clocks part.
     #[error("the peer claims to have held a message {peer_ns} ns of a round trip of {own_ns} ns")]
     NegativeRoundTrip {
         /// t4 - t1, ns.
@@ -78,7 +78,8 @@ pub struct OffsetEstimate {
     pub rtt_min: Duration,
     /// Round trip of the newest accepted exchange.
     pub rtt_latest: Duration,
-    /// The true offset is within this of `offset_ns`: half of `rtt_min`, growing with `age` by 1000 ppm.
+    /// The true offset is within this of `offset_ns`: half of `rtt_min`, and 1000 ppm of the time since that exchange
+    /// began.
     pub uncertainty: Duration,
     /// Time since the exchange the offset comes from.
     pub age: Duration,
@@ -87,16 +88,17 @@ pub struct OffsetEstimate {
 #[derive(Clone, Copy, Debug)]
 struct Best {
     slot: u64,
+    sent: MonoTime,
     at: MonoTime,
     offset_ns: i64,
     rtt_ns: i64,
 }
 
 impl Best {
-    /// Bound of the error of this offset at `now`, ns.
+    /// Bound of the error of this offset at `now`, ns. The clocks part during the exchange too.
     fn bound_ns(&self, now: MonoTime) -> i128 {
-        let age = i128::from(now.0.saturating_sub(self.at.0));
-        i128::from(self.rtt_ns + 1) / 2 + age * MAX_DRIFT_PPM / 1_000_000
+        let age = i128::from(now.0.saturating_sub(self.sent.0));
+        i128::from(self.rtt_ns + 1) / 2 + drift_ns(age)
     }
 }
 
@@ -133,9 +135,11 @@ impl ClockOffset {
         if own < 0 || hold < 0 {
             return Err(ClockError::Backwards { own_ns: cut(own), peer_ns: cut(hold) });
         }
-        if rtt < 0 {
+        // The peer's clock may be the faster one.
+        if rtt < -drift_ns(hold) - 1 {
             return Err(ClockError::NegativeRoundTrip { own_ns: cut(own), peer_ns: cut(hold) });
         }
+        let rtt = rtt.max(0);
         if rtt > MAX_RTT_NS || hold > MAX_HOLD_NS {
             return Err(ClockError::TooLong { rtt_ns: cut(rtt), hold_ns: cut(hold) });
         }
@@ -147,7 +151,8 @@ impl ClockOffset {
             return Err(ClockError::OutOfRange);
         }
         let now = exchange.received;
-        let new = Best { slot: now.0 / SLOT_NS, at: now, offset_ns: cut(offset), rtt_ns: cut(rtt) };
+        let new =
+            Best { slot: now.0 / SLOT_NS, sent: exchange.sent, at: now, offset_ns: cut(offset), rtt_ns: cut(rtt) };
 
         if self.peer_epoch != Some(peer_epoch) {
             *self = Self { peer_epoch: Some(peer_epoch), ..Self::default() };
@@ -214,6 +219,11 @@ impl ClockOffset {
     fn best(&self, now: MonoTime) -> Option<&Best> {
         self.slots.iter().flatten().min_by_key(|best| best.bound_ns(now))
     }
+}
+
+/// The most that two clocks part in a time, ns.
+const fn drift_ns(time: i128) -> i128 {
+    time * MAX_DRIFT_PPM / 1_000_000
 }
 
 fn cut(ns: i128) -> i64 {

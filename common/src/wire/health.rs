@@ -25,7 +25,7 @@ pub enum Rejection {
     Stale = 4,
     /// From another operator process than the one being followed.
     Operator = 5,
-    /// Its age cannot be told: no clock offset yet.
+    /// Its age cannot be told: no clock offset yet, or one that is uncertain by more than the oldest age.
     Clock = 6,
     /// Another reason.
     Other = 7,

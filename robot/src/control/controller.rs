@@ -311,9 +311,10 @@ impl Controller {
                 });
             };
         match mode {
-            // The limit widens tenfold over the ramp, then only the joints' own limits count.
+            // The limit widens tenfold over the ramp, then only the joints' own limits count. A ramp of no length (0 / 0)
+            // is over when it begins.
             Mode::Engaging => {
-                let widened = params.engage_speed * (1.0 + 9.0 * lasted / params.engage_ramp);
+                let widened = params.engage_speed * (1.0 + 9.0 * (lasted / params.engage_ramp).min(1.0));
                 follow(conditioner, &self.target, widened, &self.movable);
             }
             Mode::Engaged => follow(conditioner, &self.target, f64::INFINITY, &self.movable),
