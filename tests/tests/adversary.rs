@@ -379,7 +379,9 @@ impl World {
         tally.requests += 1;
         let before = self.shared.latch.get();
         let holder = self.receiver.holder(at).map(|(epoch, _)| epoch);
-        self.receiver.on_control(arrival);
+        // On both keys: on each of them the other's request is none.
+        self.receiver.on_stop(arrival);
+        self.receiver.on_reset(arrival);
         let after = self.shared.latch.get();
         let expected =
             match decode::<ControlMessage>(bytes).ok().and_then(|message| Some((message.request()?, message))) {
