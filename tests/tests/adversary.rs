@@ -44,6 +44,9 @@ const STAMPS: std::ops::Range<usize> = 24..64;
 const NUMBERS: std::ops::Range<usize> = 64..312;
 const EPOCH: std::ops::Range<usize> = 8..16;
 
+/// A message under way: when it arrives, its number, whether it is a pose, its bytes.
+type Letter = (u64, u64, bool, Vec<u8>);
+
 /// What differs between the runs.
 #[derive(Clone, Copy)]
 struct Setting {
@@ -117,8 +120,8 @@ struct World {
     shared: Arc<Shared>,
     now: u64,
     operators: [Operator; 2],
-    /// Messages under way: when they arrive, their number, whether they are poses, their bytes.
-    under_way: BinaryHeap<Reverse<(u64, u64, bool, Vec<u8>)>>,
+    /// Messages under way.
+    under_way: BinaryHeap<Reverse<Letter>>,
     number: u64,
     /// Messages seen, to be sent again.
     history: VecDeque<Vec<u8>>,
@@ -521,7 +524,8 @@ impl World {
             assert_eq!(command.q, record.state.q);
             return;
         }
-        let still = !record.mode.follows() && !(record.mode == Mode::Relaxed && self.setting.relax == Relax::Open);
+        let opens = record.mode == Mode::Relaxed && self.setting.relax == Relax::Open;
+        let still = !record.mode.follows() && !opens;
         for (slot, joint) in self.hand.joints.iter().enumerate() {
             let (q, tau) = (command.q[slot], command.tau[slot]);
             assert!((joint.lower..=joint.upper).contains(&q), "{} at {q}", joint.name);

@@ -205,7 +205,9 @@ fn run(combination: &Combination, seed: u64, poses: &[MasterPose], all_ticks: bo
                     out.obeyed = out.obeyed.max(age.as_secs_f64());
                     playout.push(passed.captured, passed.received, &passed.pose);
                     (sample, refused_good) = (Some(passed), false);
-                    due = due.filter(|_| all_ticks).or(Some(nanos(now).div_ceil(nanos(TICK))));
+                    if !all_ticks {
+                        due = Some(nanos(now).div_ceil(nanos(TICK)));
+                    }
                 } else {
                     let newer = sample.is_some_and(|last| sequence > last.sequence);
                     refused_good |= newer && age + doubt < MAX_AGE;
@@ -349,9 +351,11 @@ fn every_combination_of_what_a_link_can_do() {
         DELAYS.map(|ms| format!("delay {ms} ms")).into(),
         JITTERS.map(|ms| format!("jitter +- {ms} ms")).into(),
         LOSSES.map(|share| format!("{:.0} % lost", 100.0 * share)).into(),
-        ORDERS.map(|late| late.map_or("stream".into(), |late| format!("{:.0} % late by 30 ms", 100.0 * late))).into(),
+        ORDERS
+            .map(|late| late.map_or_else(|| "stream".into(), |late| format!("{:.0} % late by 30 ms", 100.0 * late)))
+            .into(),
         BLACKOUTS
-            .map(|dark| dark.map_or("never dark".into(), |(s, every)| format!("dark {s} s every {every} s")))
+            .map(|dark| dark.map_or_else(|| "never dark".into(), |(s, every)| format!("dark {s} s every {every} s")))
             .into(),
         DRIFTS.map(|ppm| format!("clock {ppm:+} ppm")).into(),
     ];
