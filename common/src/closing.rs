@@ -97,7 +97,10 @@ fn improve(
     velocity: &mut JointVector,
     [low, high]: [&JointVector; 2],
 ) {
-    let slope = |finger: &Opposed<'_>| thumb.map_or(finger.jacobian.column(slot).into_owned(), |own| -own.column(slot));
+    let slope = |finger: &Opposed<'_>| match thumb {
+        Some(own) => -own.column(slot),
+        None => finger.jacobian.column(slot).into_owned(),
+    };
     let own = (POSTURE_WEIGHT * HORIZON).powi(2);
     let (mut gradient, mut curvature) = (own * (velocity[joint] - wanted[joint]), own);
     for finger in fingers.iter() {

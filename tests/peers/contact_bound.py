@@ -35,13 +35,11 @@ class Chain:
         self.steps, limits, link = [], [], own["pole"]
         while link in by_child:
             joint = by_child[link]
-            origin = joint.find("origin")
-            numbers = lambda name: np.array([float(v) for v in origin.get(name, "0 0 0").split()])
             turn = None
             if joint.get("type") != "fixed":
-                turn = np.array([float(v) for v in joint.find("axis").get("xyz").split()])
+                turn = numbers(joint, "axis", "xyz")
                 limits.append([float(joint.find("limit").get(end)) for end in ("lower", "upper")])
-            self.steps.append((numbers("xyz"), rpy(*numbers("rpy")), turn))
+            self.steps.append((numbers(joint, "origin", "xyz"), rpy(*numbers(joint, "origin", "rpy")), turn))
             link = joint.find("parent").get("link")
         self.steps.reverse()
         self.lower, self.upper = np.array(limits[::-1]).T
@@ -69,6 +67,10 @@ class Chain:
         return 0.5 * np.einsum("ni,ij,nj->n", half, least, half)
 
 
+def numbers(joint: ElementTree.Element, child: str, name: str) -> np.ndarray:
+    return np.array([float(value) for value in joint.find(child).get(name, "0 0 0").split()])
+
+
 def rpy(roll: float, pitch: float, yaw: float) -> np.ndarray:
     x, y, z = (about(axis, np.array([angle]))[0] for axis, angle in zip(np.eye(3), (roll, pitch, yaw)))
     return z @ y @ x
@@ -87,10 +89,10 @@ def chains(folder: Path, side: str) -> dict[str, Chain]:
     return {finger["name"]: Chain(urdf, description, finger["name"]) for finger in description["finger"]}
 
 
-def box(path: np.ndarray, before: int, frames: int, eps: float, speed: float, dt: float) -> tuple[np.ndarray, np.ndarray]:
-    """Where each joint can be that many frames after frame `before`, if it was within eps of `path` then."""
+def box(path: np.ndarray, before: int, eps: float, travel: float) -> tuple[np.ndarray, np.ndarray]:
+    """Where each joint can be after so much travel (rad), if in frame `before` it was within eps of `path`."""
     last = path[max(before - 1, 0) : before + 1]
-    way = eps + speed * dt * frames
+    way = eps + travel
     return last.min(axis=0) - way, last.max(axis=0) + way
 
 

@@ -5,8 +5,8 @@ joint paths x of a recording's frames, and prints Markdown tables.
 
 1. Smoothness. The least mean |x[t+1] - 2 x[t] + x[t-1]| of a path that stays within eps of the given one, joint by
    joint and frame by frame; of one that may be anywhere with the joints of thumb and pinching finger in the frames in
-   which the human pinches, which allows any posture of contact and any gap; and of one that is exactly on the given path
-   there.
+   which the human pinches, which allows any posture of contact and any gap; and of one that is exactly on the given
+   path there.
 2. Causal smoothness. The same if x[t] is a weighted mean of the last 15 frames (half a second) of the given path, the
    weights, of either sign, of each joint the best ones for this very recording: what a causal linear filter could do at
    best. "Exact in the pinches": there it steps aside.
@@ -21,8 +21,8 @@ x[t-1] and x[t], which every constant or changing delay of up to a frame fulfils
 between frames too; only what they imply for the frames themselves is asked for, |x[t+1] - x[t]| <= v dt and
 |x[t+1] - 2 x[t] + x[t-1]| <= a dt^2. Both make the bounds lower, so that they hold for every retargeter.
 
-Proved is: no path that is that faithful in joint space is smoother (1), no causal linear filter of the last 15 frames is
-(2), none keeps to the limits and to the mapping's own postures of contact (3), none brings the tips nearer (4). Not
+Proved is: no path that is that faithful in joint space is smoother (1), no causal linear filter of the last 15 frames
+is (2), none keeps to the limits and to the mapping's own postures of contact (3), none brings the tips nearer (4). Not
 proved is anything about paths that are faithful in another sense, nor, by 2, about filters that are not linear: our own
 is not. The joint limits are left out of 1 to 3, which makes the bounds lower again.
 """
@@ -61,8 +61,8 @@ def main() -> None:
     table = np.loadtxt(arguments.recording, delimiter=",", skiprows=1)
     dt = float(np.median(np.diff(table[:, 1])))
     pinched = pinches(table[:, 2:].reshape(-1, 21, 3), 1e-3 * arguments.pinch, arguments.hand)
-    measured = retarget(arguments, "--mode", "joint", "--filter", "off")
-    combined = retarget(arguments)
+    measured, _ = retarget(arguments, "--mode", "joint", "--filter", "off")
+    combined, tips = retarget(arguments)
     if not len(measured) == len(combined) == len(table):
         sys.exit(f"error: {arguments.robot} gives {len(combined)} frames for {len(table)}")
 
@@ -105,6 +105,10 @@ def main() -> None:
     row("within eps of the combined mapping before, rad", "finger", "frames", "proved at least", "found")
     row(*["---"] * 5)
     chains = contact_bound.chains(URDF, arguments.hand)
+    for finger, chain in chains.items():
+        off = np.abs(chain.tip(combined[:, chain.joints])[0] - tips[finger]).max()
+        if not off < 1e-9:
+            sys.exit(f"error: the {finger}'s tips are {off:.3g} m from those that {arguments.robot} gives")
     for finger in ("index", "middle", "ring"):
         here = pinched[:, chains[finger].joints].all(axis=1)
         for eps in REACH_TOLERANCES if here.any() else ():
@@ -119,7 +123,7 @@ def contact(chains: dict, path: np.ndarray, here: np.ndarray, frame: int, finger
         before -= 1
     if before < 0:
         return 0.0, 0.0
-    low, high = contact_bound.box(path, before, frame - before, eps, SPEED, dt)
+    low, high = contact_bound.box(path, before, eps, SPEED * dt * (frame - before))
     return contact_bound.least_gap(chains["thumb"], chains[finger], low, high)
 
 
@@ -127,8 +131,8 @@ def row(*cells) -> None:
     print(f"| {' | '.join(map(str, cells))} |")
 
 
-def retarget(arguments: argparse.Namespace, *more: str) -> np.ndarray:
-    """Joint angles (frames, joints), rad, by `robot retarget`."""
+def retarget(arguments: argparse.Namespace, *more: str) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Joint angles (frames, joints), rad, and each finger's pole (frames, 3), m, by `robot retarget`."""
     with tempfile.TemporaryDirectory() as folder:
         output = Path(folder) / "frames.jsonl"
         command = [arguments.robot, "retarget", "--hand", arguments.hand, "--input", arguments.recording]
@@ -136,7 +140,9 @@ def retarget(arguments: argparse.Namespace, *more: str) -> np.ndarray:
         done = subprocess.run(command, capture_output=True, text=True)
         if done.returncode != 0:
             sys.exit(f"error: {' '.join(map(str, command))}\n{done.stderr.strip()}")
-        return np.array([json.loads(line)["q"] for line in output.read_text().splitlines()])
+        rows = [json.loads(line) for line in output.read_text().splitlines()]
+        tips = {finger: np.array([row["p"][finger] for row in rows]) for finger in rows[0]["p"]}
+        return np.array([row["q"] for row in rows]), tips
 
 
 def pinches(human: np.ndarray, threshold: float, side: str) -> np.ndarray:
@@ -153,8 +159,14 @@ def pinches(human: np.ndarray, threshold: float, side: str) -> np.ndarray:
 
 def band(path: np.ndarray, lag: int) -> tuple[np.ndarray, np.ndarray]:
     """Least and largest value of one joint's path (frames,) from each frame back to `lag` frames before."""
-    before = [np.concatenate([np.full(shift, path[0]), path[: len(path) - shift]]) for shift in range(lag + 1)]
-    return np.min(before, axis=0), np.max(before, axis=0)
+    before = shifted(path, lag + 1)
+    return before.min(axis=1), before.max(axis=1)
+
+
+def shifted(path: np.ndarray, count: int) -> np.ndarray:
+    """One joint's path (frames,) and what it was 1 to `count` - 1 frames before, (frames, count)."""
+    before = [np.concatenate([np.full(shift, path[0]), path[: len(path) - shift]]) for shift in range(count)]
+    return np.stack(before, axis=1)
 
 
 def difference(frames: int, order: int) -> csr_array:
@@ -167,8 +179,8 @@ def difference(frames: int, order: int) -> csr_array:
 def smoothest(
     path: np.ndarray, exact: np.ndarray, eps: float, lag: int, loose: np.ndarray | None = None, taps: int = 0
 ) -> float:
-    """The least mean second difference, rad, within `eps` of `path`, on it where `exact` and anywhere where `loose` (all
-    (frames, joints)); with `taps`, of what a weighted sum of so many last frames makes of it."""
+    """The least mean second difference, rad, within `eps` of `path`, on it where `exact`, anywhere where `loose` (all of
+    them (frames, joints)); with `taps`, of what a weighted sum of so many last frames makes of it."""
     frames, joints = path.shape
     second = difference(frames, 2)
     count = second.shape[0]
@@ -181,8 +193,7 @@ def smoothest(
         own = exact[:, joint]
         # x = base variables + fixed, and sum(s) is minimised with -s <= D x <= s.
         if taps:
-            before = [np.concatenate([np.full(shift, path[0, joint]), path[: frames - shift, joint]]) for shift in range(taps)]
-            base, fixed = np.stack(before, axis=1), np.where(own, path[:, joint], 0.0)
+            base, fixed = shifted(path[:, joint], taps), np.where(own, path[:, joint], 0.0)
             base[own] = 0.0
             base = csr_array(base)
             low, high = np.where(own, -np.inf, low), np.where(own, np.inf, high)
