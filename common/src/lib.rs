@@ -11,6 +11,7 @@
 //! | [`master`] | the human hand: the paradigmatic 20-joint model, keypoint fit, calibration, gestures |
 //! | [`mapping`] | the combined joint-Cartesian mapping, Eq. 1-14 |
 //! | [`conditioner`] | from targets that may jump to commands within the limits |
+//! | [`closing`] | contacts first: tips that cannot keep up meet before they take up their postures |
 //! | [`guard`] | keeps fingertips, links and palm out of each other |
 //! | [`ik`] | bounded lexicographic inverse kinematics of one finger |
 //! | [`paper`] | the paper's tables and figures as numbers |
@@ -24,6 +25,7 @@
 //! | [`testing`] | where tests find recordings |
 
 pub mod authority;
+pub mod closing;
 pub mod conditioner;
 pub mod guard;
 pub mod hand;

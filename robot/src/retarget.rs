@@ -30,6 +30,9 @@ use crate::usage::UsageError;
 /// After this long without a frame the hand stands still, whatever it did before.
 const SETTLED: Duration = Duration::from_secs(3);
 
+/// Frames that are read, then mapped, then written at a time: each of the three finds its code and data in the caches.
+const BLOCK: usize = 64;
+
 /// Maps recordings, frame by frame, as many at a time as there are threads.
 ///
 /// # Errors
@@ -114,18 +117,30 @@ fn one(job: &Job, args: &RetargetArgs, config: &Config, hand: &HandModel, bar: &
     // One frame behind: what the live robot commands for a frame is known when the next one comes.
     let mut waiting: Option<(HandFrame, MappingOutput)> = None;
     let (mut period, mut done) = (0.0, 0);
-    for frame in frames {
-        let frame = frame?;
-        let begun = Instant::now();
-        let mapped = retargeter.map(&frame.pose);
-        stats.record(begun.elapsed());
-        let (t, read) = (frame.t, frame.read);
-        if let Some((before, mapping)) = waiting.replace((frame, mapped)) {
-            finish(&before, mapping, t)?;
-            period = t - before.t;
+    let mut frames = frames.fuse();
+    let (mut block, mut mapped) = (Vec::with_capacity(BLOCK), Vec::with_capacity(BLOCK));
+    loop {
+        for frame in frames.by_ref().take(BLOCK) {
+            block.push(frame?);
         }
-        bar.inc(read - done);
-        done = read;
+        if block.is_empty() {
+            break;
+        }
+        for frame in &block {
+            let begun = Instant::now();
+            let mapping = retargeter.map(&frame.pose);
+            stats.record(begun.elapsed());
+            mapped.push(mapping);
+        }
+        for (frame, mapping) in block.drain(..).zip(mapped.drain(..)) {
+            let (t, read) = (frame.t, frame.read);
+            if let Some((before, mapping)) = waiting.replace((frame, mapping)) {
+                finish(&before, mapping, t)?;
+                period = t - before.t;
+            }
+            bar.inc(read - done);
+            done = read;
+        }
     }
     if let Some((last, mapping)) = waiting {
         finish(&last, mapping, last.t + period)?;

@@ -5,19 +5,20 @@
 //! posture x0 as little as possible to one whose spheres do not:
 //!
 //! ```text
-//! argmin  sum_f w^2 ||F_f(x) - F_f(x0)||^2 + sum_ab ||F_ab(x) - F_ab(x0)||^2 + mu^2 ||x - x0||^2
+//! argmin  sum_f w^2 ||F_f(x) - F_f(x0)||^2 + sum_f v_f ||F_Tf(x) - F_Tf(x0)||^2 + mu^2 ||x - x0||^2
 //! subject to  ||c_a(x) - c_b(x)|| >= R_a + R_b - allowance,    x in the joint box,
 //! ```
 //!
-//! with poles F_f, centres c_f, and the vectors F_ab between the poles of overlapping pairs, which decide a grasp and
-//! so weigh more than the places. Because a finger can turn its distal phalanx while its pole stays where it is, most
-//! of the overlap goes into that turn and little into the gap between the poles: the fingers meet tip to tip, as a
-//! person's do. Solved by sequential quadratic programming with one multiplier per pair.
+//! with poles F_f, centres c_f, and the vectors F_Tf from the thumb's pole to those of the fingers at it, which decide a
+//! grasp and so weigh more than the places. Because a finger can turn its distal phalanx while its pole stays where it
+//! is, most of the overlap goes into that turn and little into the gap between the poles: the fingers meet tip to tip,
+//! as a person's do. Two fingers that meet at the thumb part sideways. Solved by sequential quadratic programming with
+//! one multiplier per pair.
 
 use nalgebra::{SMatrix, SVector, Vector3};
 
 use super::direction;
-use crate::hand::{HandModel, Joint, JointVector, MAX_FINGERS, MAX_JOINTS, TipFrame, TipJacobian};
+use crate::hand::{Finger, HandModel, Joint, JointVector, MAX_FINGERS, MAX_JOINTS, TipFrame, TipJacobian};
 
 const MAX_PAIRS: usize = MAX_FINGERS * (MAX_FINGERS - 1) / 2;
 
@@ -26,7 +27,7 @@ const POSTURE_WEIGHT: f64 = 3e-3;
 /// w: what a metre of one pole's place weighs against one between two poles.
 const PLACE_WEIGHT: f64 = 0.2;
 /// Linearisations at most.
-const ITERATIONS: usize = 10;
+const ITERATIONS: usize = 16;
 /// Times that joints are found to be at their end in each linearisation.
 const MAX_HELD: usize = 3;
 /// Sweeps over the pairs in each linearisation.
@@ -45,6 +46,9 @@ const SETTLED: f64 = 1e-3;
 pub struct TipGuard {
     // Radius of each fingertip's sphere, m.
     radii: [f64; MAX_FINGERS],
+    // Base of each finger in the palm frame, m.
+    bases: Centers,
+    thumb: Option<usize>,
     allowance: f64,
 }
 
@@ -75,7 +79,12 @@ impl TipGuard {
         for (radius, chain) in radii.iter_mut().zip(&hand.fingers) {
             *radius = (chain.pole - chain.center).norm();
         }
-        Self { radii, allowance }
+        let mut bases = Centers::default();
+        for (base, chain) in bases.iter_mut().zip(&hand.fingers) {
+            *base = hand.anatomical_from_palm.tr_mul(&chain.base);
+        }
+        let thumb = hand.fingers.iter().position(|chain| chain.finger == Finger::Thumb);
+        Self { radii, bases, thumb, allowance }
     }
 
     /// The deepest overlap of any two fingertips at `q`, m; negative if all are apart.
@@ -145,10 +154,30 @@ impl TipGuard {
                 let neither = !movable[a] && !movable[b];
                 out.fingers[a] |= movable[a] || neither;
                 out.fingers[b] |= movable[b] || neither;
-                out.pairs[a][b] = true;
             }
         }
         any
+    }
+
+    /// v: how much the vector between two poles counts: of thumb and finger 1 where their tips touch, and less the
+    /// farther they are apart. How two fingers lie to each other decides no grasp.
+    fn grasp(&self, wanted: &Tips, a: usize, b: usize) -> f64 {
+        if self.thumb != Some(a) && self.thumb != Some(b) {
+            return 0.0;
+        }
+        let apart = (wanted[b].center - wanted[a].center).norm() - self.radii[a] - self.radii[b];
+        let share = (apart / NEAR).clamp(0.0, 1.0);
+        1.0 - share * share * (3.0 - 2.0 * share)
+    }
+
+    /// In which direction `b` goes out of `a`. Of two fingers that are sent to one place the tips' own direction is
+    /// chance: the deeper they are in each other, the more it is that of their bases.
+    fn normal(&self, a: usize, b: usize, between: &Vector3<f64>) -> Vector3<f64> {
+        if self.thumb == Some(a) || self.thumb == Some(b) {
+            return direction(*between);
+        }
+        let depth = (self.radii[a] + self.radii[b] - between.norm()).max(0.0);
+        direction(between + direction(self.bases[b] - self.bases[a]) * depth)
     }
 
     /// One step of the sequential quadratic program from `x`, by joint.
@@ -188,9 +217,12 @@ impl TipGuard {
             hessian += jacobian.tr_mul(&jacobian) * weight;
         };
         let error = |finger: usize| now[finger].pole - wanted[finger].pole;
-        for (a, b) in pairs(count).filter(|&(a, b)| state.pairs[a][b]) {
-            let jacobian = place(a, &now[a].pole_jacobian, -1.0) + place(b, &now[b].pole_jacobian, 1.0);
-            add(jacobian, error(b) - error(a), 1.0);
+        for (a, b) in pairs(count).filter(|&(a, b)| state.fingers[a] || state.fingers[b]) {
+            let weight = self.grasp(wanted, a, b);
+            if weight > 0.0 {
+                let jacobian = place(a, &now[a].pole_jacobian, -1.0) + place(b, &now[b].pole_jacobian, 1.0);
+                add(jacobian, error(b) - error(a), weight);
+            }
         }
         for finger in (0..count).filter(|&finger| state.fingers[finger]) {
             add(place(finger, &now[finger].pole_jacobian, 1.0), error(finger), PLACE_WEIGHT * PLACE_WEIGHT);
@@ -205,10 +237,9 @@ impl TipGuard {
         let mut close = 0;
         for (a, b) in pairs(count).filter(|&(a, b)| state.fingers[a] || state.fingers[b]) {
             let between = now[b].center - now[a].center;
-            let distance = between.norm();
-            let lacking = self.radii[a] + self.radii[b] - self.allowance - distance;
+            let normal = self.normal(a, b, &between);
+            let lacking = self.radii[a] + self.radii[b] - self.allowance - between.dot(&normal);
             if lacking > -NEAR {
-                let normal = direction(between);
                 let jacobian = place(a, &now[a].center_jacobian, -1.0) + place(b, &now[b].center_jacobian, 1.0);
                 slack[close] = Pair { slope: jacobian.tr_mul(&normal), lacking, multiplier: 0.0 };
                 close += 1;
@@ -267,7 +298,6 @@ impl TipGuard {
 #[derive(Clone, Copy, Default)]
 struct Involved {
     fingers: [bool; MAX_FINGERS],
-    pairs: [[bool; MAX_FINGERS]; MAX_FINGERS],
 }
 
 type Tips = [Tip; MAX_FINGERS];

@@ -2,6 +2,7 @@ use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 use teleop_common::authority::{Clutch, Heard, Intent, Latch, Machine, MachineParams};
+use teleop_common::closing;
 use teleop_common::guard::{MotionGuard, TipGuard};
 use teleop_common::hand::{HandModel, JointVector, MAX_FINGERS};
 use teleop_common::mapping::{MappingOutput, MappingParams, ParamError, Retargeter};
@@ -182,9 +183,9 @@ pub struct Controller {
     sample: Option<PoseSample>,
     played: Option<Played>,
     mapping: Option<MappingOutput>,
-    // Its posture with the fingertips apart, and the fingers that may give way for that.
+    // Its posture with the fingertips apart, and the gains of the hand's fingers.
     target: JointVector,
-    movable: [bool; MAX_FINGERS],
+    gains: [f64; MAX_FINGERS],
     // The last valid state of the hand.
     state: JointState,
     tick: u64,
@@ -216,7 +217,7 @@ impl Controller {
             played: None,
             mapping: None,
             target: state.q,
-            movable: [false; MAX_FINGERS],
+            gains: [0.0; MAX_FINGERS],
             state,
             tick: 0,
             now: MonoTime(0),
@@ -304,22 +305,25 @@ impl Controller {
             .conditioner
             .get_or_insert_with(|| Conditioner::new(hand, &state.q, 1.0 / params.rate, params.smoothing));
         let (mut torque, mut limp) = (1.0, false);
-        let follow =
-            |conditioner: &mut Conditioner, target: &JointVector, speed: f64, movable: &[bool; MAX_FINGERS]| {
-                conditioner.follow(target, speed, |q, velocity, range| {
-                    self.motion.guard(hand, q, movable, velocity, range, 1.0 / params.rate);
-                });
-            };
+        // A pose is followed contacts first.
+        let follow = |conditioner: &mut Conditioner, speed: f64| {
+            conditioner.follow(&self.target, speed, |q, velocity, range| {
+                closing::close(hand, &self.gains, q, &self.target, velocity, range);
+                self.motion.guard(hand, q, &movable(&self.gains), velocity, range, 1.0 / params.rate);
+            });
+        };
         match mode {
             // The limit widens tenfold over the ramp, then only the joints' own limits count. A ramp of no length (0 / 0)
             // is over when it begins.
             Mode::Engaging => {
                 let widened = params.engage_speed * (1.0 + 9.0 * (lasted / params.engage_ramp).min(1.0));
-                follow(conditioner, &self.target, widened, &self.movable);
+                follow(conditioner, widened);
             }
-            Mode::Engaged => follow(conditioner, &self.target, f64::INFINITY, &self.movable),
+            Mode::Engaged => follow(conditioner, f64::INFINITY),
             Mode::Relaxed if params.relax == Relax::Open => {
-                follow(conditioner, &hand.home(), params.engage_speed, &[true; MAX_FINGERS]);
+                conditioner.follow(&hand.home(), params.engage_speed, |q, velocity, range| {
+                    self.motion.guard(hand, q, &[true; MAX_FINGERS], velocity, range, 1.0 / params.rate);
+                });
             }
             _ => {
                 conditioner.hold();
@@ -344,13 +348,17 @@ impl Controller {
             return;
         }
         let mapping = self.retargeter.map(&played.pose);
-        // A finger that only copies the human's shape keeps it: the others go round it.
-        self.movable = [false; MAX_FINGERS];
-        self.movable.iter_mut().zip(mapping.fingers()).for_each(|(own, signals)| *own = signals.k > 0.0);
-        self.target = self.guard.apart(self.retargeter.hand(), &mapping.q, &self.movable);
+        self.gains = [0.0; MAX_FINGERS];
+        self.gains.iter_mut().zip(mapping.fingers()).for_each(|(own, signals)| *own = signals.k);
+        self.target = self.guard.apart(self.retargeter.hand(), &mapping.q, &movable(&self.gains));
         self.mapping = Some(mapping);
         self.played = Some(played);
     }
+}
+
+/// Who gives way: a finger that only copies the human's shape keeps it, the others go round it.
+fn movable(gains: &[f64; MAX_FINGERS]) -> [bool; MAX_FINGERS] {
+    gains.map(|gain| gain > 0.0)
 }
 
 /// Torques of the position controller (PD with velocity feed-forward), limited to a `share` of each joint's limit.
