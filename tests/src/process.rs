@@ -348,3 +348,31 @@ impl Robot {
         &self.endpoints[0]
     }
 }
+
+/// A running `robot router`.
+#[derive(Debug)]
+pub struct Router {
+    /// The process.
+    pub process: Process,
+    /// Where robots, operators and other routers connect.
+    pub endpoint: String,
+}
+
+impl Router {
+    /// Starts a router that listens on one endpoint.
+    ///
+    /// # Panics
+    /// If it is not ready soon.
+    #[must_use]
+    pub fn listening(endpoint: &str, more: &[&str]) -> Self {
+        let process = Process::start("robot", &[&["router", "--listen", endpoint], more].concat());
+        let mut found = String::new();
+        eventually("the router says where it listens", || {
+            let log = process.stderr();
+            let line = log.split_once("operators connect to ").and_then(|(_, rest)| rest.lines().next());
+            found = line.unwrap_or_default().to_owned();
+            !found.is_empty()
+        });
+        Self { process, endpoint: found }
+    }
+}

@@ -14,7 +14,7 @@ use teleop_common::time::{Histogram, MonoTime};
 use teleop_common::wire::{Message as _, PoseMessage, Quantiles};
 use teleop_tests::eventually;
 use teleop_tests::probe::Probe;
-use teleop_tests::process::{Process, Robot, run};
+use teleop_tests::process::{Process, Robot, Router, run};
 
 /// Clock ticks per second of /proc, the same on all Linux machines that we build for.
 const USER_HZ: f64 = 100.0;
@@ -39,18 +39,8 @@ fn name(index: usize) -> String {
 /// `count` pairs for `time`, each over a link of its own or all over one router: prints a row of the table, and gives
 /// what `operator list` tells of each robot.
 fn fleet(count: usize, time: Duration, routed: bool) -> Vec<serde_json::Value> {
-    let router = routed.then(|| {
-        let process = Process::start("robot", &["router", "--listen", "tcp/127.0.0.1:0"]);
-        let mut endpoint = String::new();
-        eventually("the router says where it listens", || {
-            let log = process.stderr();
-            let found = log.split_once("operators connect to ").and_then(|(_, rest)| rest.lines().next());
-            endpoint = found.unwrap_or_default().to_owned();
-            !endpoint.is_empty()
-        });
-        (process, endpoint)
-    });
-    let at = router.as_ref().map(|(_, endpoint)| endpoint.as_str());
+    let router = routed.then(|| Router::listening("tcp/127.0.0.1:0", &[]));
+    let at = router.as_ref().map(|router| router.endpoint.as_str());
     let connect: Vec<&str> = at.iter().flat_map(|endpoint| ["--connect", *endpoint]).collect();
     let robots: Vec<Robot> =
         (0..count).map(|index| Robot::start(&[&["--name", &*name(index)], connect.as_slice()].concat())).collect();
@@ -86,7 +76,7 @@ fn fleet(count: usize, time: Duration, routed: bool) -> Vec<serde_json::Value> {
     });
     let all = || {
         let sum = |processes: &mut dyn Iterator<Item = &Process>| processes.map(cpu).sum::<f64>();
-        let router = router.as_ref().map_or(0.0, |(process, _)| cpu(process));
+        let router = router.as_ref().map_or(0.0, |router| cpu(&router.process));
         (sum(&mut robots.iter().map(|robot| &robot.process)), sum(&mut operators.iter()), router)
     };
     let (begun, before) = (now(), all());

@@ -12,38 +12,19 @@ use teleop_tests::certificates::Certificates;
 use teleop_tests::eventually;
 use teleop_tests::judge::{assert_limits, commands};
 use teleop_tests::probe::{Probe, State};
-use teleop_tests::process::{Process, Robot, Signal, free_endpoint, run, strs};
+use teleop_tests::process::{Process, Robot, Router, Signal, free_endpoint, run, strs};
 
 const RATE: f64 = 333.0;
 const RESOLUTION: f64 = 2.5e-7;
 /// From the last pose to holding: 0.1 s, a period of the source, and up to four ticks between two states.
 const HELD_AFTER: u64 = 37 + 5;
 
-/// A router in a process of its own.
-struct Router {
-    process: Process,
-    endpoint: String,
-}
-
 const ANY_PORT: &str = "quic/127.0.0.1:0";
 
-impl Router {
-    /// One that lets ada drive the robot `robot`.
-    fn start(certificates: &Certificates, listen: &str, more: &[&str]) -> Self {
-        let mut options = vec!["router", "--listen", listen, "--allow-robot", "robot", "--allow-operator", "ada"];
-        let flags = certificates.flags("router");
-        options.extend(strs(&flags));
-        options.extend(more);
-        let process = Process::start("robot", &options);
-        let mut endpoint = String::new();
-        eventually("the router says where it listens", || {
-            let log = process.stderr();
-            let found = log.split_once("operators connect to ").and_then(|(_, rest)| rest.lines().next());
-            endpoint = found.unwrap_or_default().to_owned();
-            !endpoint.is_empty()
-        });
-        Self { process, endpoint }
-    }
+/// A router that lets ada drive the robot `robot`.
+fn router_at(certificates: &Certificates, listen: &str, more: &[&str]) -> Router {
+    let flags = certificates.flags("router");
+    Router::listening(listen, &[&["--allow-robot", "robot", "--allow-operator", "ada"], &*strs(&flags), more].concat())
 }
 
 fn robot_at(certificates: &Certificates, router: &str) -> Robot {
@@ -62,9 +43,8 @@ fn operator_at(certificates: &Certificates, router: &str) -> Process {
 #[test]
 fn robot_and_operator_meet_at_routers() {
     let certificates = Certificates::of(&["robot", "router", "ada"]);
-    let mut first = Router::start(&certificates, ANY_PORT, &["--allow-router", "router"]);
-    let mut second =
-        Router::start(&certificates, ANY_PORT, &["--connect", &first.endpoint, "--allow-router", "router"]);
+    let mut first = router_at(&certificates, ANY_PORT, &["--allow-router", "router"]);
+    let mut second = router_at(&certificates, ANY_PORT, &["--connect", &first.endpoint, "--allow-router", "router"]);
     for (at, name) in [(&first, "one router"), (&second, "two routers")] {
         let mut robot = robot_at(&certificates, &first.endpoint);
         let probe = Probe::open(&SessionConfig { role: Role::Client, ..certificates.session("ada", &at.endpoint) });
@@ -88,7 +68,7 @@ fn robot_and_operator_meet_at_routers() {
 #[test]
 fn a_router_that_dies_or_stands_still_lets_the_hand_hold_and_it_goes_on_by_itself() {
     let certificates = Certificates::of(&["robot", "router", "ada"]);
-    let mut router = Router::start(&certificates, ANY_PORT, &[]);
+    let mut router = router_at(&certificates, ANY_PORT, &[]);
     let robot = robot_at(&certificates, &router.endpoint);
     // It watches beside the router: over the robot's own port.
     let probe = Probe::open(&certificates.session("router", robot.endpoint()));
@@ -103,7 +83,7 @@ fn a_router_that_dies_or_stands_still_lets_the_hand_hold_and_it_goes_on_by_itsel
                 probe.wait_for(Mode::Holding);
                 std::thread::sleep(Duration::from_millis(500));
                 let endpoint = router.endpoint.clone();
-                router = Router::start(&certificates, &endpoint, &[]);
+                router = router_at(&certificates, &endpoint, &[]);
                 now()
             }
             _ => {
@@ -142,7 +122,7 @@ fn a_router_that_dies_or_stands_still_lets_the_hand_hold_and_it_goes_on_by_itsel
 #[test]
 fn a_router_passes_on_only_what_those_may_do_whom_it_names() {
     let certificates = Certificates::of(&["robot", "router", "ada", "olga", "eve"]);
-    let router = Router::start(&certificates, ANY_PORT, &["--allow-observer", "olga"]);
+    let router = router_at(&certificates, ANY_PORT, &["--allow-observer", "olga"]);
     let robot = robot_at(&certificates, &router.endpoint);
     let probe = Probe::open(&certificates.session("router", robot.endpoint()));
     probe.wait_for(Mode::Disarmed);
