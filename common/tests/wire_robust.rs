@@ -13,7 +13,7 @@ use teleop_common::mapping::Tuning;
 use teleop_common::master::MasterPose;
 use teleop_common::time::MonoTime;
 use teleop_common::wire::{
-    Checked, ControlMessage, Header, HealthMessage, JointStateMessage, MAX_MESSAGE, MappingMessage, Message,
+    Checked, ControlMessage, Header, HealthMessage, JointStateMessage, MAX_MESSAGE, MappingMessage, Message, PROTOCOL,
     PoseMessage, TuningMessage, WireError, decode, encode_into,
 };
 
@@ -132,8 +132,9 @@ fn header_errors_say_what_is_wrong() {
     let mut bytes = encoded(&pose());
     bytes[4] = 9;
     let error = decode::<PoseMessage>(&bytes).unwrap_err();
-    assert_eq!(error, WireError::Protocol { ours: 3, theirs: 9 });
-    assert_eq!(error.to_string(), "peer speaks wire protocol 9, this side speaks 3: run the same release on both ends");
+    assert_eq!(error, WireError::Protocol { ours: PROTOCOL, theirs: 9 });
+    let text = format!("peer speaks wire protocol 9, this side speaks {PROTOCOL}: run the same release on both ends");
+    assert_eq!(error.to_string(), text);
     bytes[0] = b'X';
     assert_eq!(decode::<PoseMessage>(&bytes).unwrap_err(), WireError::Magic { found: *b"XLGT" });
 
