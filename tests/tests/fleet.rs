@@ -51,7 +51,7 @@ fn fleet(count: usize, time: Duration, routed: bool) -> Vec<serde_json::Value> {
         .map(|(index, robot)| {
             let name = name(index);
             let more = [&["--name", &*name, "--rate", RATE], through].concat();
-            Process::operator(at.unwrap_or(robot.endpoint()), "wave", &more)
+            Process::operator(at.unwrap_or_else(|| robot.endpoint()), "wave", &more)
         })
         .collect();
     let list = || {
