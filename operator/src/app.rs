@@ -151,10 +151,13 @@ fn list_robots(args: &ListArgs, shutdown: &Shutdown) -> Result<(), Failure> {
     let config = SessionConfig { open_timeout: LINK_TIMEOUT, ..args.link.session(&connect) };
     let session = Session::open(&config).map_err(not_open)?;
     if let Some(mut rows) = list(&session, connect.len(), time, shutdown).or_runtime()? {
-        for (name, endpoint) in found.into_iter().flatten() {
-            rows.iter_mut()
-                .filter(|row| row.robot == name)
-                .for_each(|row| row.endpoint.clone_from(&Some(endpoint.clone())));
+        if let Some(found) = found {
+            for row in &mut rows {
+                // Two of one name are one row.
+                let at: Vec<_> =
+                    found.iter().filter(|(name, _)| *name == row.robot).map(|(_, at)| at.as_str()).collect();
+                row.endpoint = Some(at.join(", "));
+            }
         }
         return show(&rows, args.json).or_runtime();
     }

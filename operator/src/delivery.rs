@@ -1,8 +1,8 @@
 //! How many of the poses get lost on the way, and whether each is therefore sent twice.
 //!
-//! A hold takes a tenth of a second without any pose. Where three of ten get lost on their own that happens every few
-//! minutes, and with a copy of each, half a period later, hardly ever: ten losses in a row become twenty. The copy is the
-//! same message, so a robot that has it already refuses it as any network's duplicate.
+//! A hold takes a tenth of a second without any pose: ten losses in a row at 100 Hz, which happens by chance alone where
+//! many get lost. With a copy of each, half a period later, it takes twenty. The copy is the same message, so a robot that
+//! has it already refuses it as any network's duplicate.
 
 /// Poses that are judged at a time.
 const WINDOW: u64 = 100;

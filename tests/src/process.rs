@@ -207,6 +207,17 @@ impl Process {
         self.child.id()
     }
 
+    /// The names of its threads.
+    ///
+    /// # Panics
+    /// If it is gone.
+    #[must_use]
+    pub fn threads(&self) -> Vec<String> {
+        let tasks = std::fs::read_dir(format!("/proc/{}/task", self.id())).unwrap().flatten();
+        // One may end meanwhile.
+        tasks.filter_map(|task| std::fs::read_to_string(task.path().join("comm")).ok()).collect()
+    }
+
     /// Whether it still runs.
     pub fn is_running(&mut self) -> bool {
         self.child.try_wait().unwrap().is_none()

@@ -355,7 +355,7 @@ fn third_lost(seed: u64) {
         1e3 * rms,
         1e3 * most
     );
-    // Ten losses in a row are a hold: some every few minutes, if the operator did not send each pose twice.
+    // Ten losses in a row are a hold, so the operator sends each pose twice.
     let holds = pair.probe.health().unwrap().holds - health.holds;
     assert_eq!(holds, 0);
     assert!(pair.probe.rejected(Rejection::Sequence) > 100, "no copies came");

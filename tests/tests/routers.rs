@@ -168,6 +168,7 @@ fn deaths_on_tls(rounds: u32) {
     options.push(config);
     let mut robot = Robot::listening(&["tls/127.0.0.1:0", "udp/127.0.0.1:0"], &strs(&options));
     let probe = Probe::connect(&robot.endpoints[1]);
+    probe.wait_for(Mode::Disarmed);
     let mut witness = Process::start(
         "operator",
         &[
@@ -176,6 +177,13 @@ fn deaths_on_tls(rounds: u32) {
         ]
         .concat(),
     );
+    eventually("the watcher is there", || witness.stdout().contains("mode"));
+    // In zenoh's usual threads that is a data race, which shows as an abort in one of some forty such deaths at routers.
+    for process in [&robot.process, &witness] {
+        let threads = process.threads();
+        assert!(threads.iter().any(|name| name.starts_with("tx-")), "{threads:?}");
+        assert!(!threads.iter().any(|name| name.starts_with("rx-")), "it receives in a thread of its own: {threads:?}");
+    }
     for round in 0..rounds {
         let mut operator = Process::operator(&robot.endpoints[0], "wave", &strs(&certificates.flags("ada")));
         eventually("it is followed", || probe.last().is_some_and(|state| state.follows()));
